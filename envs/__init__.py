@@ -1,0 +1,32 @@
+"""The slipping car and its world: physics, costs, scenarios and Gymnasium environments.
+
+    gym.make("slipcar.envs:SlipCar-v0", scenario="paper", observation="features")
+    gym.make_vec("slipcar.envs:SlipCar-v0", num_envs=1024,
+                 vectorization_mode="vector_entry_point")
+
+The module prefix in the id makes it work everywhere, in spawned workers too.
+"""
+
+import gymnasium as gym
+
+from slipcar.envs.scenario import Scenario
+from slipcar.envs.slip_car import SlipCarEnv
+from slipcar.envs.transition import Transition, control_from_action, transition
+from slipcar.envs.vector import SlipCarVectorEnv
+
+__all__ = [
+    "Scenario",
+    "SlipCarEnv",
+    "SlipCarVectorEnv",
+    "Transition",
+    "control_from_action",
+    "transition",
+]
+
+# Re-imports (spawned workers, reloads) would otherwise warn about overriding.
+if "SlipCar-v0" not in gym.registry:
+    gym.register(
+        id="SlipCar-v0",
+        entry_point="slipcar.envs.slip_car:SlipCarEnv",
+        vector_entry_point="slipcar.envs.vector:SlipCarVectorEnv",
+    )

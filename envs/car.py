@@ -1,0 +1,96 @@
+"""The car that slips: drift and diffusion of its Itô equation, written once.
+
+    dx = b(x, u) dt + σ(x) dB,     x = (r_x, r_y, θ, v, ω),     u = (a_v, a_ω)
+    b(x, u) = (v cos θ, v sin θ, ω, a_v, a_ω)
+    σ(x)    = ω v diag(α², α², β²) on (r_x, r_y, θ), zero on (v, ω)
+
+(paper §6.3, SPEC §2). Noise is zero when the car stands or drives straight. The part
+z = (v, ω) is never reached by the noise, so in open loop it is deterministic.
+
+Every function is batched over leading axes and follows the array API: NumPy and Torch
+arrays go in, the same kind comes out; complex arrays pass through (complex-step).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from array_api_compat import array_namespace
+
+#: State, control and Brownian dimensions. σ has three non-zero rows, so three Brownian
+#: motions drive it; SPEC's 5 x 5 diagonal is this matrix with two zero columns dropped.
+STATE_DIM, CONTROL_DIM, NOISE_DIM = 5, 2, 3
+STATE_NAMES = ("r_x", "r_y", "θ", "v", "ω")
+STATE_UNITS = ("m", "m", "rad", "m/s", "rad/s")
+CONTROL_NAMES = ("a_v", "a_ω")
+CONTROL_UNITS = ("m/s²", "rad/s²")
+
+
+def drift(x: Any, u: Any) -> Any:
+    """Time derivative of the mean motion.
+
+    Args:
+        x: states, (..., 5) [m, m, rad, m/s, rad/s].
+        u: controls, (..., 2) [m/s², rad/s²].
+
+    Returns:
+        b(x, u), (..., 5). SPEC §2.
+    """
+    xp = array_namespace(x, u)
+    theta, v = x[..., 2], x[..., 3]
+    return xp.stack(
+        [v * xp.cos(theta), v * xp.sin(theta), x[..., 4], u[..., 0], u[..., 1]], axis=-1
+    )
+
+
+def drift_jacobian(x: Any, u: Any) -> tuple[Any, Any]:
+    """Jacobians of :func:`drift`: ∂b/∂x (..., 5, 5) and ∂b/∂u (..., 5, 2)."""
+    xp = array_namespace(x, u)
+    theta, v = x[..., 2], x[..., 3]
+    cos, sin = xp.cos(theta), xp.sin(theta)
+    A = xp.zeros((*x.shape[:-1], STATE_DIM, STATE_DIM), dtype=x.dtype)
+    A[..., 0, 2] = -v * sin
+    A[..., 0, 3] = cos
+    A[..., 1, 2] = v * cos
+    A[..., 1, 3] = sin
+    A[..., 2, 4] = 1.0
+    B = xp.zeros((*x.shape[:-1], STATE_DIM, CONTROL_DIM), dtype=x.dtype)
+    B[..., 3, 0] = 1.0
+    B[..., 4, 1] = 1.0
+    return A, B
+
+
+def slip_intensity(x: Any, slip: Any) -> Any:
+    """Standard deviation per √s of the noise on (r_x, r_y, θ): ω v (α², α², β²).
+
+    Args:
+        x: states, (..., 5).
+        slip: (α², β²).
+
+    Returns:
+        The non-zero diagonal of σ(x), signed, (..., 3).
+    """
+    xp = array_namespace(x)
+    product = x[..., 3] * x[..., 4]
+    alpha, beta = slip[0] * product, slip[1] * product
+    return xp.stack([alpha, alpha, beta], axis=-1)
+
+
+def diffusion(x: Any, slip: Any) -> Any:
+    """Diffusion matrix σ(x), (..., 5, 3); see :func:`slip_intensity`."""
+    xp = array_namespace(x)
+    scale = slip_intensity(x, slip)
+    sigma = xp.zeros((*x.shape[:-1], STATE_DIM, NOISE_DIM), dtype=x.dtype)
+    for i in range(NOISE_DIM):
+        sigma[..., i, i] = scale[..., i]
+    return sigma
+
+
+def diffusion_jacobian(x: Any, slip: Any) -> Any:
+    """∂σ/∂x, (..., 5, 3, 5): last axis is the state that is differentiated."""
+    xp = array_namespace(x)
+    d_sigma = xp.zeros((*x.shape[:-1], STATE_DIM, NOISE_DIM, STATE_DIM), dtype=x.dtype)
+    for i, s in enumerate((slip[0], slip[0], slip[1])):
+        d_sigma[..., i, i, 3] = s * x[..., 4]
+        d_sigma[..., i, i, 4] = s * x[..., 3]
+    return d_sigma

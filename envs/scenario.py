@@ -1,0 +1,343 @@
+"""A scenario: everything that says which problem is posed, as data.
+
+A `Scenario` is a frozen, validated dataclass with a JSON round trip. It is the one object
+that the environment, the planner and the evaluation share: its methods bind the physics of
+:mod:`slipcar.envs.car` and the costs of :mod:`slipcar.envs.cost` to its numbers, and with
+them it satisfies `slipcar.planner.Problem`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slipcar.envs import car, cost, worlds
+from slipcar.envs.validate import checked_array, checked_float, checked_int
+
+_FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scenario:
+    """The car's task: from `start` to `goal` in `horizon` seconds, past `obstacles`.
+
+        minimise  E[ Σ dt ‖u_k‖² + Σ dt λ Σ_o max(0, (δ_o+ε)² − ‖r_k − r_o‖²)² ]
+        s.t.      dx = b(x, u) dt + σ(x) dB,   x(0) = start,   E[x(T)] = goal,   |u| ≤ bounds
+
+    Attributes:
+        start: x⁰ = (r_x, r_y, θ, v, ω), (5,) [m, m, rad, m/s, rad/s].
+        goal: x^f, (5,), same units.
+        horizon: T > 0 [s].
+        nodes: N ≥ 2; the control is constant on each of the N − 1 intervals of dt = T/(N−1).
+        obstacles: (k, 3) rows x, y, radius [m], radius > 0, none over start or goal.
+        clearance: ε ≥ 0 [m], added to each radius in the obstacle cost, not in collisions.
+        obstacle_weight: λ ≥ 0 [1/(m⁴ s)] .
+        goal_weight: diagonal of W ≥ 0, (5,); a scalar is repeated (default 100).
+        slip: (α², β²), both ≥ 0.
+        control_bounds: (2,) largest |a_v| [m/s²] and |a_ω| [rad/s²], or None for unbounded.
+
+    Raises:
+        ValueError: naming the field, the bad value and what is allowed.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    horizon: float = 5.0
+    nodes: int = 41
+    obstacles: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    clearance: float = 0.13
+    obstacle_weight: float = 500.0
+    goal_weight: np.ndarray = dataclasses.field(default_factory=lambda: np.full(5, 100.0))
+    slip: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.1, 0.01]))
+    control_bounds: np.ndarray | None = dataclasses.field(
+        default_factory=lambda: np.array([2.0, 4.0])
+    )
+
+    def __post_init__(self) -> None:
+        set_field = functools.partial(object.__setattr__, self)
+        set_field("start", checked_array("start", self.start, (car.STATE_DIM,)))
+        set_field("goal", checked_array("goal", self.goal, (car.STATE_DIM,)))
+        set_field("horizon", checked_float("horizon", self.horizon, above=0.0))
+        set_field("nodes", checked_int("nodes", self.nodes, at_least=2))
+        set_field("clearance", checked_float("clearance", self.clearance, at_least=0.0))
+        set_field(
+            "obstacle_weight", checked_float("obstacle_weight", self.obstacle_weight, at_least=0.0)
+        )
+        set_field(
+            "goal_weight",
+            checked_array(
+                "goal_weight", self.goal_weight, (car.STATE_DIM,), at_least=0.0, repeat_scalar=True
+            ),
+        )
+        set_field("slip", checked_array("slip", self.slip, (2,), at_least=0.0))
+        if self.control_bounds is not None:
+            set_field(
+                "control_bounds",
+                checked_array("control_bounds", self.control_bounds, (car.CONTROL_DIM,), above=0.0),
+            )
+        set_field("obstacles", self._checked_obstacles())
+
+    def _checked_obstacles(self) -> np.ndarray:
+        given = self.obstacles
+        if given is None or np.size(given) == 0:
+            given = np.zeros((0, 3))
+        obstacles = checked_array("obstacles", given, (None, 3))
+        for i, (x, y, radius) in enumerate(obstacles):
+            if radius <= 0.0:
+                raise ValueError(f"obstacles[{i}]: radius must be > 0 m, not {radius:g}")
+            for name, state in (("start", self.start), ("goal", self.goal)):
+                distance = float(np.hypot(state[0] - x, state[1] - y))
+                if distance < radius:
+                    raise ValueError(
+                        f"obstacles[{i}] (centre ({x:g}, {y:g}) m, radius {radius:g} m) lies over "
+                        f"the {name} at ({state[0]:g}, {state[1]:g}) m: the distance to its "
+                        f"centre is {distance:g} m and must be at least the radius"
+                    )
+        return obstacles
+
+    # ---------------------------------------------------------------- identity and variants
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scenario):
+            return NotImplemented
+        return self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        return hash(self.to_json())
+
+    def replace(self, **changes: Any) -> Scenario:
+        """A copy with some fields changed, validated again.
+
+        Raises:
+            ValueError: for an unknown field or a bad value.
+        """
+        known = [field.name for field in dataclasses.fields(self)]
+        unknown = sorted(set(changes) - set(known))
+        if unknown:
+            raise ValueError(f"a scenario has no field {unknown}; its fields are {known}")
+        return dataclasses.replace(self, **changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain Python data, exact to the last bit."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {
+            "format": _FORMAT,
+            **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()},
+        }
+
+    def to_json(self) -> str:
+        """JSON text; `from_json` gives back an equal scenario."""
+        return json.dumps(self.to_dict())
+
+    @classmethod
+    def from_json(cls, text: str) -> Scenario:
+        """The scenario that :meth:`to_json` wrote.
+
+        Raises:
+            ValueError: if the text is no JSON object, has unknown or missing fields, or a
+                value is out of range.
+        """
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"not a scenario: the text is not JSON ({error})") from error
+        if not isinstance(data, dict):
+            raise ValueError(f"not a scenario: expected a JSON object, not {type(data).__name__}")
+        version = data.pop("format", _FORMAT)
+        if version != _FORMAT:
+            raise ValueError(
+                f"scenario format {version!r} is unknown; this version reads {_FORMAT}"
+            )
+        known = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(data) - set(known))
+        missing = sorted({"start", "goal"} - set(data))
+        if unknown or missing:
+            raise ValueError(
+                f"not a scenario: unknown fields {unknown}, missing fields {missing}; "
+                f"the fields are {known}"
+            )
+        return cls(**data)
+
+    @staticmethod
+    def names() -> list[str]:
+        """Names that :meth:`named` knows, `paper` first."""
+        return list(worlds.NAMED)
+
+    @classmethod
+    def named(cls, name: str) -> Scenario:
+        """A scenario by name; see :mod:`slipcar.envs.worlds`.
+
+        Raises:
+            ValueError: for an unknown name, listing the known ones.
+        """
+        if name not in worlds.NAMED:
+            raise ValueError(f"unknown scenario {name!r}; the named ones are {cls.names()}")
+        return cls(**worlds.NAMED[name])
+
+    @classmethod
+    def random(
+        cls, seed: int, obstacles: int | None = None, *, turned: bool = False, **changes: Any
+    ) -> Scenario:
+        """A random world: goal 2.5–4.5 m away, obstacles between, none over start or goal.
+
+        Args:
+            seed: the same seed gives the same world.
+            obstacles: how many, 0 to 8; None draws 1 to 8.
+            turned: also draw start and goal headings.
+            **changes: fields that replace the drawn or default ones.
+
+        Raises:
+            ValueError: for a seed or number out of range.
+        """
+        checked_int("seed", seed, at_least=0)
+        if obstacles is not None:
+            checked_int("obstacles", obstacles, at_least=0, at_most=worlds.MAX_RANDOM_OBSTACLES)
+        return cls(**{**worlds.random_world(seed, obstacles, turned), **changes})
+
+    @classmethod
+    def of(cls, scenario: Scenario | str) -> Scenario:
+        """The scenario itself, or the named one for a string."""
+        if isinstance(scenario, Scenario):
+            return scenario
+        if isinstance(scenario, str):
+            return cls.named(scenario)
+        raise ValueError(
+            f"expected a Scenario or one of the names {cls.names()}, not {type(scenario).__name__}"
+        )
+
+    # ---------------------------------------------------------------- the problem it poses
+
+    @property
+    def dt(self) -> float:
+        """Length of a control interval [s]."""
+        return self.horizon / (self.nodes - 1)
+
+    @functools.cached_property
+    def times(self) -> np.ndarray:
+        """Node times, (N,) [s]."""
+        return _frozen(np.linspace(0.0, self.horizon, self.nodes))
+
+    @functools.cached_property
+    def control_weight(self) -> np.ndarray:
+        """R of G(u) = uᵀ R u, (2, 2): the identity."""
+        return _frozen(np.eye(car.CONTROL_DIM))
+
+    @property
+    def angles(self) -> tuple[int, ...]:
+        """Components of the state that are angles of period 2π."""
+        return (2,)
+
+    def drift(self, t: Any, x: Any, u: Any) -> Any:
+        """b(x, u), (..., 5); see :func:`slipcar.envs.car.drift`."""
+        return car.drift(x, u)
+
+    def drift_jacobian(self, t: Any, x: Any, u: Any) -> tuple[Any, Any]:
+        """∂b/∂x (..., 5, 5) and ∂b/∂u (..., 5, 2)."""
+        return car.drift_jacobian(x, u)
+
+    def diffusion(self, t: Any, x: Any) -> Any:
+        """σ(x), (..., 5, 3)."""
+        return car.diffusion(x, self.slip)
+
+    def diffusion_jacobian(self, t: Any, x: Any) -> Any:
+        """∂σ/∂x, (..., 5, 3, 5)."""
+        return car.diffusion_jacobian(x, self.slip)
+
+    @functools.cached_property
+    def penalty_weight(self) -> np.ndarray:
+        """λ for every obstacle, (k,)."""
+        return _frozen(np.full(len(self.obstacles), self.obstacle_weight))
+
+    def penalty(self, t: Any, x: Any) -> Any:
+        """c_o(r), (..., k) [m²]: the cost is λ Σ max(0, c_o)²."""
+        return cost.obstacle_constraints(x, self.obstacles, self.clearance)
+
+    def penalty_jacobian(self, t: Any, x: Any) -> Any:
+        """∂c_o/∂x, (..., k, 5)."""
+        return cost.obstacle_constraints_jacobian(x, self.obstacles)
+
+    def terminal(self, x: Any) -> Any:
+        """g(x) = x − x^f, (..., 5)."""
+        return x - self.goal
+
+    def terminal_jacobian(self, x: Any) -> Any:
+        """∂g/∂x, (..., 5, 5): the identity."""
+        return np.broadcast_to(np.eye(car.STATE_DIM), (*x.shape[:-1], car.STATE_DIM, car.STATE_DIM))
+
+    def initial_guess(self) -> tuple[np.ndarray, np.ndarray]:
+        """The straight line with its heading and speed: states (N, 5) and zero controls.
+
+        A guess with θ = v = 0 along the line leaves r_y uncontrollable (SPEC §2, "start").
+        """
+        fraction = (self.times / self.horizon)[:, None]
+        x = self.start + fraction * (self.goal - self.start)
+        offset = self.goal[:2] - self.start[:2]
+        x[:, 2] = np.arctan2(offset[1], offset[0])
+        x[:, 3] = np.hypot(*offset) / self.horizon
+        x[:, 4] = 0.0
+        x[0] = self.start
+        return x, np.zeros((self.nodes - 1, car.CONTROL_DIM))
+
+    # ---------------------------------------------------------------- what a path costs
+
+    def control_power(self, u: Any) -> Any:
+        """‖u‖², (...,)."""
+        return cost.control_power(u)
+
+    def obstacle_power(self, x: Any) -> Any:
+        """λ Σ_o max(0, c_o)², (...,)."""
+        return cost.obstacle_power(x, self.obstacles, self.clearance, self.obstacle_weight)
+
+    def goal_cost(self, x: Any) -> Any:
+        """(x − x^f)ᵀ W (x − x^f), (...,)."""
+        return cost.goal_cost(x, self.goal, self.goal_weight)
+
+    def signed_distance(self, x: Any) -> Any:
+        """Distance to the nearest obstacle's rim [m], negative inside, (...,)."""
+        return cost.signed_distance(x, self.obstacles)
+
+    # ---------------------------------------------------------------- what a controller sees
+
+    def decode_observation(self, observation: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Time (...,) and state (..., 5) from an observation of either kind.
+
+        Heading comes back modulo 2π from `features`; see `angles`.
+
+        Raises:
+            ValueError: if the last axis fits neither kind.
+        """
+        from slipcar.envs import observation as layouts
+
+        return layouts.decode(self, observation)
+
+    def encode_control(self, u: Any) -> Any:
+        """Action in [−1, 1] for a control in physical units, clipped to the bounds.
+
+        Raises:
+            ValueError: if the scenario has no control bounds to scale by.
+        """
+        return np.clip(u / self.action_scale, -1.0, 1.0)
+
+    @property
+    def action_scale(self) -> np.ndarray:
+        """Control per unit of action, (2,).
+
+        Raises:
+            ValueError: if the scenario is unbounded: actions in [−1, 1] need a scale.
+        """
+        if self.control_bounds is None:
+            raise ValueError(
+                "control_bounds is None: actions in [-1, 1] need bounds to be scaled by; "
+                "use scenario.replace(control_bounds=(2.0, 4.0)), for example"
+            )
+        return self.control_bounds
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array.setflags(write=False)
+    return array
