@@ -14,6 +14,7 @@ import json
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike
 
 from slipcar.envs import car, cost, worlds
@@ -84,7 +85,7 @@ class Scenario:
 
     def _checked_obstacles(self) -> np.ndarray:
         given = self.obstacles
-        if given is None or np.size(given) == 0:
+        if given is None or (isinstance(given, (list, tuple)) and len(given) == 0):
             given = np.zeros((0, 3))
         obstacles = checked_array("obstacles", given, (None, 3))
         for i, (x, y, radius) in enumerate(obstacles):
@@ -108,7 +109,9 @@ class Scenario:
         return self.to_dict() == other.to_dict()
 
     def __hash__(self) -> int:
-        return hash(self.to_json())
+        # Of numbers, not of text: 0.0 and -0.0 are equal and must hash alike.
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return hash(tuple(tuple(v.flat) if isinstance(v, np.ndarray) else v for v in values))
 
     def replace(self, **changes: Any) -> Scenario:
         """A copy with some fields changed, validated again.
@@ -175,7 +178,7 @@ class Scenario:
         Raises:
             ValueError: for an unknown name, listing the known ones.
         """
-        if name not in worlds.NAMED:
+        if not isinstance(name, str) or name not in worlds.NAMED:
             raise ValueError(f"unknown scenario {name!r}; the named ones are {cls.names()}")
         return cls(**worlds.NAMED[name])
 
@@ -242,11 +245,11 @@ class Scenario:
 
     def diffusion(self, t: Any, x: Any) -> Any:
         """σ(x), (..., 5, 3)."""
-        return car.diffusion(x, self.slip)
+        return car.diffusion(x, self.slip.tolist())
 
     def diffusion_jacobian(self, t: Any, x: Any) -> Any:
         """∂σ/∂x, (..., 5, 3, 5)."""
-        return car.diffusion_jacobian(x, self.slip)
+        return car.diffusion_jacobian(x, self.slip.tolist())
 
     @functools.cached_property
     def penalty_weight(self) -> np.ndarray:
@@ -255,19 +258,20 @@ class Scenario:
 
     def penalty(self, t: Any, x: Any) -> Any:
         """c_o(r), (..., k) [m²]: the cost is λ Σ max(0, c_o)²."""
-        return cost.obstacle_constraints(x, self.obstacles, self.clearance)
+        return cost.obstacle_constraints(x, _like(x, self.obstacles), self.clearance)
 
     def penalty_jacobian(self, t: Any, x: Any) -> Any:
         """∂c_o/∂x, (..., k, 5)."""
-        return cost.obstacle_constraints_jacobian(x, self.obstacles)
+        return cost.obstacle_constraints_jacobian(x, _like(x, self.obstacles))
 
     def terminal(self, x: Any) -> Any:
         """g(x) = x − x^f, (..., 5)."""
-        return x - self.goal
+        return x - _like(x, self.goal)
 
     def terminal_jacobian(self, x: Any) -> Any:
         """∂g/∂x, (..., 5, 5): the identity."""
-        return np.broadcast_to(np.eye(car.STATE_DIM), (*x.shape[:-1], car.STATE_DIM, car.STATE_DIM))
+        shape = (*x.shape[:-1], car.STATE_DIM, car.STATE_DIM)
+        return array_namespace(x).broadcast_to(_like(x, np.eye(car.STATE_DIM)), shape)
 
     def initial_guess(self) -> tuple[np.ndarray, np.ndarray]:
         """The straight line with its heading and speed: states (N, 5) and zero controls.
@@ -291,15 +295,16 @@ class Scenario:
 
     def obstacle_power(self, x: Any) -> Any:
         """λ Σ_o max(0, c_o)², (...,)."""
-        return cost.obstacle_power(x, self.obstacles, self.clearance, self.obstacle_weight)
+        obstacles = _like(x, self.obstacles)
+        return cost.obstacle_power(x, obstacles, self.clearance, self.obstacle_weight)
 
     def goal_cost(self, x: Any) -> Any:
         """(x − x^f)ᵀ W (x − x^f), (...,)."""
-        return cost.goal_cost(x, self.goal, self.goal_weight)
+        return cost.goal_cost(x, _like(x, self.goal), _like(x, self.goal_weight))
 
     def signed_distance(self, x: Any) -> Any:
         """Distance to the nearest obstacle's rim [m], negative inside, (...,)."""
-        return cost.signed_distance(x, self.obstacles)
+        return cost.signed_distance(x, _like(x, self.obstacles))
 
     # ---------------------------------------------------------------- what a controller sees
 
@@ -336,6 +341,14 @@ class Scenario:
                 "use scenario.replace(control_bounds=(2.0, 4.0)), for example"
             )
         return self.control_bounds
+
+
+def _like(x: Any, values: np.ndarray) -> Any:
+    """The values as the kind of array x is: NumPy's as they are, Torch's with x's dtype."""
+    if isinstance(x, np.ndarray):
+        return values
+    # A copy, because Torch warns when it is handed read-only memory.
+    return array_namespace(x).asarray(values.copy(), dtype=x.dtype, device=device(x))
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -67,7 +67,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
     * v0: first release.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012  as gymnasium.Env declares it
         "render_modes": ["rgb_array", "human"],
         "render_fps": RENDER_FPS,
     }

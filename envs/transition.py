@@ -37,7 +37,7 @@ class Transition:
 def transition(scenario: Scenario, x: Any, u: Any, noise: Any) -> Transition:
     """Advance states x (..., 5) under controls u (..., 2) with noise (..., substeps, 3)."""
     dt = scenario.dt
-    state = euler_maruyama(x, u, dt, noise, scenario.slip)
+    state = euler_maruyama(x, u, dt, noise, scenario.slip.tolist())
     return Transition(
         state=state,
         effort=dt * scenario.control_power(u),

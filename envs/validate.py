@@ -31,6 +31,8 @@ def checked_array(
         ValueError: naming `name`, the bad value and the allowed range or shape.
     """
     try:
+        if np.iscomplexobj(value):  # NumPy would only warn and drop the imaginary part
+            raise TypeError("complex numbers")
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be an array of numbers, not {value!r}") from error
@@ -62,9 +64,10 @@ def checked_int(name: str, value: Any, *, at_least: int, at_most: int | None = N
     allowed = f"at least {at_least}" if at_most is None else f"between {at_least} and {at_most}"
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise ValueError(f"{name} must be an integer {allowed}, not {value!r}")
-    if value < at_least or (at_most is not None and value > at_most):
-        raise ValueError(f"{name} must be {allowed}, not {value}")
-    return int(value)
+    number = int(value)
+    if number < at_least or (at_most is not None and number > at_most):
+        raise ValueError(f"{name} must be {allowed}, not {number}")
+    return number
 
 
 def _check_range(name: str, array: np.ndarray, at_least: float | None, above: float | None) -> None:
@@ -78,4 +81,4 @@ def _check_range(name: str, array: np.ndarray, at_least: float | None, above: fl
     if not np.all(good):
         index = tuple(int(i) for i in np.argwhere(~good)[0])
         where = f"{name}{list(index)}" if index else name
-        raise ValueError(f"{where} must be {allowed}, not {array[index]!r}")
+        raise ValueError(f"{where} must be {allowed}, not {float(array[index])!r}")

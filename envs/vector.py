@@ -73,9 +73,9 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         steps = self.scenario.nodes - 1
         # Steps first, so that the noise of one step of all environments is contiguous.
         self._noise = np.empty((steps, self.num_envs, self.substeps, 3))
-        self._x = np.empty((self.num_envs, 5))
+        self._x = np.tile(self.scenario.start, (self.num_envs, 1))
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
-        self._distance = np.empty(self.num_envs)
+        self._distance = np.full(self.num_envs, np.inf)
         self._over = np.ones(self.num_envs, dtype=bool)
 
     def reset(
@@ -108,8 +108,8 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         if isinstance(seed, (int, np.integer)):
             seed = [int(seed) + i for i in range(self.num_envs)]
-        if seed is not None and len(seed) != self.num_envs:
-            raise ValueError(f"seed must have {self.num_envs} entries, not {len(seed)}")
+        if seed is not None and np.asarray(seed, dtype=object).shape != (self.num_envs,):
+            raise ValueError(f"seed must be None, an int or {self.num_envs} of them, not {seed!r}")
         if not self._rngs:
             self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
         if seed is not None:
@@ -117,8 +117,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 if seed[i] is not None:
                     self._rngs[i] = seeding.np_random(seed[i])[0]
         self._start_episodes(mask)
-        info = self._info(np.zeros((self.num_envs, 2)), *np.zeros((3, self.num_envs)), here=mask)
-        return self._observe(), info
+        return self._observe(), self._info_at_start(mask)
 
     def _start_episodes(self, mask: np.ndarray) -> None:
         for i in np.flatnonzero(mask):
@@ -170,7 +169,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             over |= self._distance < 0.0
             if started is not None:
                 over &= running
-        self._over = over
+        self._over = over.copy()  # _start_episodes writes to it
         any_over = bool(over.any())
         goal = np.zeros(self.num_envs)
         if any_over:
@@ -178,22 +177,21 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         info = self._info(u, effort, obstacle, goal)
         reward = -(effort + obstacle + goal)
         observation = self._observe()
-        terminated = over.copy()
         if any_over and self.autoreset_mode is AutoresetMode.SAME_STEP:
             final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(over):
                 final[i] = observation[i].copy()
-            self._start_episodes(over.copy())
-            fresh = self._info(np.zeros((self.num_envs, 2)), *np.zeros((3, self.num_envs)))
+            self._start_episodes(over)
+            fresh = self._info_at_start(over)
             info = {
                 **{k: _choose(over, fresh[k], info[k]) for k in info},
                 "final_obs": final,
-                "_final_obs": terminated.copy(),
+                "_final_obs": over.copy(),
                 "final_info": {k: _masked(over, info[k]) for k in info},
-                "_final_info": terminated.copy(),
+                "_final_info": over.copy(),
             }
             observation = self._observe()
-        return observation, reward, terminated, np.zeros(self.num_envs, dtype=bool), info
+        return observation, reward, over, np.zeros(self.num_envs, dtype=bool), info
 
     def _noise_now(self) -> np.ndarray:
         first = self._steps[0]
@@ -204,6 +202,10 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _observe(self) -> np.ndarray:
         t = self._steps * self.scenario.dt
         return layouts.observe(self.scenario, self.observation, t, self._x)
+
+    def _info_at_start(self, here: np.ndarray) -> dict[str, Any]:
+        nothing = np.zeros(self.num_envs)
+        return self._info(np.zeros((self.num_envs, 2)), nothing, nothing, nothing, here)
 
     def _info(
         self,

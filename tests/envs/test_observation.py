@@ -1,0 +1,121 @@
+"""Observations carry (t, x), stay in their bounds and say so when they cannot be read."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slipcar.envs import Scenario
+from slipcar.envs.observation import (
+    KINDS,
+    LAYOUTS,
+    decode,
+    describe,
+    observation_space,
+    observe,
+)
+
+PAPER = Scenario.named("paper")
+SHAPES = [(), (1,), (6,), (2, 3), (0,)]
+
+
+def draw(shape, scenario=PAPER, seed=0):
+    rng = np.random.default_rng(seed)
+    t = scenario.dt * rng.integers(0, scenario.nodes, size=shape)
+    return t, rng.uniform(-1, 1, (*shape, 5)) * np.array([5, 5, 10, 3, 6])
+
+
+def wrapped(angle):
+    return np.abs(np.angle(np.exp(1j * angle)))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scenario", [PAPER, Scenario.random(4, turned=True, horizon=3.7)])
+def test_decode_inverts_observe(shape, kind, scenario):
+    t, x = draw(shape, scenario)
+    observation = observe(scenario, kind, t, x)
+    assert observation.dtype == np.float32
+    assert observation.shape == (*shape, len(LAYOUTS[kind]))
+    time, state = scenario.decode_observation(observation)
+    assert state.dtype == time.dtype == np.float64
+    assert time.shape == shape
+    np.testing.assert_allclose(time, t, atol=1e-6)
+    others = [0, 1, 3, 4]
+    np.testing.assert_allclose(state[..., others], x[..., others], atol=2e-6)
+    assert np.all(wrapped(state[..., 2] - x[..., 2]) < 2e-6)
+    if kind == "state":  # heading itself, not modulo 2π
+        np.testing.assert_allclose(state[..., 2], x[..., 2], atol=2e-6)
+
+
+@given(
+    st.floats(0, 5), st.tuples(*[st.floats(-50, 50)] * 2, *[st.floats(-20, 20)] * 3).map(np.array)
+)
+def test_any_state_near_the_world_comes_back(t, x):
+    for kind in KINDS:
+        time, state = decode(PAPER, observe(PAPER, kind, t, x))
+        assert abs(time - t) < 1e-6
+        np.testing.assert_allclose(state[[0, 1, 3, 4]], x[[0, 1, 3, 4]], rtol=1e-6, atol=1e-5)
+        assert wrapped(state[2] - x[2]) < 1e-5
+
+
+@given(st.floats(0, 5), st.tuples(*[st.floats(-1e9, 1e9)] * 5).map(np.array))
+def test_no_state_leaves_the_bounds(t, x):
+    for kind in KINDS:
+        assert observation_space(PAPER, kind).contains(observe(PAPER, kind, t, x))
+
+
+@pytest.mark.parametrize("name", Scenario.names())
+@pytest.mark.parametrize("kind", KINDS)
+def test_bounds_are_finite_and_hold_at_every_node_time(kind, name):
+    scenario = Scenario.named(name)
+    space = observation_space(scenario, kind)
+    assert np.isfinite(space.low).all()
+    assert np.isfinite(space.high).all()
+    for k in range(scenario.nodes):
+        assert space.contains(observe(scenario, kind, k * scenario.dt, scenario.start))
+
+
+def test_features_by_hand():
+    """SPEC §5, one entry after the other."""
+    t, x = 4.0, np.array([1.2, 2.5, math.pi / 6, 0.4, -0.3])
+    to_go = np.array([1.0, 0.5, -math.pi / 6, 0.4, -0.3])  # T − t = 1 s
+    expected = [
+        *[0.5, 0.25, math.cos(math.pi / 6), 0.5, 0.4, -0.3, 0.6],
+        *to_go,
+    ]
+    np.testing.assert_allclose(observe(PAPER, "features", t, x), expected, rtol=1e-6)
+
+
+def test_rates_are_clipped_and_finite_at_the_horizon():
+    x = np.array([100.0, -100.0, 50.0, 50.0, -50.0])
+    rates = observe(PAPER, "features", PAPER.horizon, x)[7:]
+    np.testing.assert_array_equal(rates, [-5, 5, -5, 5, -5])
+    at_goal = observe(PAPER, "features", PAPER.horizon, np.array(PAPER.goal))
+    np.testing.assert_array_equal(at_goal[7:], np.zeros(5))
+
+
+def test_layouts_name_every_entry():
+    for kind in KINDS:
+        assert describe(kind) == {"kind": kind, "entries": list(LAYOUTS[kind])}
+        assert observation_space(PAPER, kind).shape == (len(LAYOUTS[kind]),)
+
+
+@pytest.mark.parametrize("kind", ["feature", "", None, 3])
+def test_unknown_kinds_list_the_known_ones(kind):
+    message = r"unknown observation .*the kinds are \['features', 'state'\]"
+    for call in (
+        lambda: observation_space(PAPER, kind),
+        lambda: observe(PAPER, kind, 0.0, np.zeros(5)),
+        lambda: describe(kind),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (6, 7), (3, 0)])
+def test_what_is_no_observation_cannot_be_decoded(shape):
+    with pytest.raises(ValueError, match=r"12 entries \(features\) or 6 \(state\)"):
+        decode(PAPER, np.zeros(shape))
