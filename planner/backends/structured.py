@@ -1,0 +1,269 @@
+"""Newton's method on active sets for the sub-problem: a few LQ problems, each one banded solve.
+
+The sub-problem is a linear-quadratic problem but for convex piecewise quadratics: hinge rows,
+control bounds and the exact terminal penalty. Which piece each of them is on is the *active
+set*; given it, the optimality conditions are linear (:mod:`.kkt`). The solution says which
+pieces it lies on; when they are the assumed ones, it is the optimum, to machine precision.
+Full steps settle this in one to six solves as a rule; where one would raise the convex
+objective, an exact line search shortens it. What does not settle soon (many bounds active, a
+terminal condition that cannot be met) goes to :mod:`.interior_point`, whose solution's active
+set is then polished here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from slipcar.planner.backends import Solution, failed
+from slipcar.planner.backends.interior_point import interior_point
+from slipcar.planner.backends.kkt import BandedKkt, Point, Rows
+from slipcar.planner.convexify import Subproblem
+
+Array = np.ndarray
+
+#: Solves before the interior point takes over, and those it leaves for polishing.
+_SOLVES, _POLISHING_SOLVES = 20, 4
+#: Active bounds are held by a weight so much stiffer than the cost of control: the control
+#: passes its bound by 1e-12 of what its multiplier would make of it, and is clipped in the end.
+_BOUND_WIDTH = 1e-12
+#: The terminal condition gives way by this much as its multiplier reaches ρ.
+_TERMINAL_WIDTH = 1e-9
+#: What is less than this off its bound or box is on it, for an interior point's solution.
+_NEAR = 1e-6
+
+
+@dataclasses.dataclass
+class _ActiveSet:
+    """Which piece every piecewise quadratic is on."""
+
+    hinge: Array  # (K, p) bool
+    lower: Array  # (K, m) bool
+    upper: Array  # (K, m) bool
+    terminal: Array  # (q,) signed: 0 inside the box, ±1 held at its side, ±2 multiplier at ±ρ
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ActiveSet) and all(
+            np.array_equal(getattr(self, f.name), getattr(other, f.name))
+            for f in dataclasses.fields(self)
+        )
+
+
+class StructuredSolver:
+    """Solver for sub-problems of one shape; remembers the last active set as a warm start."""
+
+    def __init__(self) -> None:
+        self._kkt: BandedKkt | None = None
+        self._active: _ActiveSet | None = None
+
+    def solve(self, sub: Subproblem) -> Solution:
+        """Solve one sub-problem; see the module's docstring."""
+        shape = (*sub.f.shape, len(sub.g))
+        if self._kkt is None or self._kkt.shape != shape:
+            self._kkt, self._active = BandedKkt(*shape), None
+        kkt, pieces = self._kkt, _Pieces(sub)
+        kkt.load(sub)
+        active = self._active
+        if active is None or active.hinge.shape != sub.b.shape:
+            active = pieces.none()
+        point, solves = _newton(kkt, pieces, active, _SOLVES)
+        if point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho:
+            inner, more = interior_point(sub, kkt)
+            solves += more
+            if inner is None:
+                self._active = None
+                return failed(sub, solves, f"not solved after {solves} LQ solves")
+            point, more = _newton(kkt, pieces, pieces.near(inner), _POLISHING_SOLVES)
+            solves += more
+            # The last interior systems are ill-conditioned: judge what the controls really do.
+            candidates = [pieces.replayed(p) for p in (inner, point) if p is not None]
+            point = min(candidates, key=pieces.objective_of)
+        self._active = dataclasses.replace(
+            pieces.near(point), terminal=np.ones(len(sub.g), dtype=np.int64)
+        )
+        e = np.clip(point.e, sub.lower, sub.upper) if pieces.bounded else point.e
+        return Solution(
+            found=True,
+            d=point.d,
+            e=e,
+            adjoint=point.adjoint,
+            terminal=point.terminal,
+            objective=sub.objective(point.d, e),
+            iterations=solves,
+        )
+
+
+def _newton(
+    kkt: BandedKkt, pieces: _Pieces, active: _ActiveSet, limit: int
+) -> tuple[Point | None, int]:
+    """The point that lies on the pieces it was computed with, if found; and the solves taken."""
+    point: Point | None = None
+    value = np.inf
+    for solves in range(1, limit + 1):
+        target = kkt.solve(*pieces.lq(active))
+        if target is None:
+            return None, solves
+        target_value = pieces.objective(target)
+        step = 1.0
+        if point is not None and target_value > value:
+            step = pieces.line_search(point, target)
+        if point is None or step > 1.0 - 1e-10:
+            step, point, value = 1.0, target, target_value
+        else:
+            point = point.towards(target, step)
+            value = pieces.objective(point)
+        found = pieces.active_set(point, active.terminal)
+        if step == 1.0 and found == active:
+            return point, solves
+        active = found
+    return None, limit
+
+
+class _Pieces:
+    """The piecewise quadratics of a sub-problem."""
+
+    def __init__(self, sub: Subproblem) -> None:
+        self.sub = sub
+        self.bounded = sub.bounded
+        self.stiffness = float(np.max(np.einsum("kii->ki", sub.R))) / _BOUND_WIDTH
+        # Keeps the matrix regular where the linearised dynamics cannot reach a direction: the
+        # multiplier then comes out beyond ρ.
+        self.softness = (
+            _TERMINAL_WIDTH * max(1.0, float(np.max(np.abs(sub.g), initial=0.0))) / sub.rho
+        )
+
+    def none(self) -> _ActiveSet:
+        """No hinge, no bound, the terminal condition held."""
+        sub, off = self.sub, np.zeros(self.sub.r.shape, dtype=bool)
+        held = np.ones(len(sub.g), dtype=np.int64)
+        return _ActiveSet(np.zeros(sub.b.shape, dtype=bool), off, off, held)
+
+    def hinge_arguments(self, d: Array) -> Array:
+        """Linearised c at nodes 1..K, (K, p)."""
+        return np.matmul(self.sub.a, d[..., None])[..., 0] + self.sub.b
+
+    def lq(self, active: _ActiveSet) -> tuple[Rows, Array, Array, Array, tuple | None]:
+        """What the LQ problem of an active set adds; arguments of `BandedKkt.solve`."""
+        sub = self.sub
+        node, which = np.nonzero(active.hinge)
+        h = sub.h[node, which]
+        rows = Rows(node, sub.a[node, which], h, h * sub.b[node, which])
+        held = np.abs(active.terminal) == 1
+        diagonal = np.where(held, -self.softness, 1.0)
+        side = np.sign(active.terminal) * sub.tolerance - sub.g
+        right = np.where(held, side, active.terminal // 2 * sub.rho)
+        control = None
+        if self.bounded:
+            at_bound = active.lower | active.upper
+            if at_bound.any():
+                stiff = self.stiffness * at_bound
+                bound = np.where(active.upper, sub.upper, np.where(active.lower, sub.lower, 0.0))
+                control = (stiff, -stiff * bound)
+        return rows, held, diagonal, right, control
+
+    def active_set(self, point: Point, before: Array) -> _ActiveSet:
+        """Pieces a Newton point lies on; `before` are the terminal pieces it was computed with."""
+        sub, nu = self.sub, point.terminal
+        # What is held shows no residual; its multiplier tells where it wants to go. (A held
+        # condition is clipped only by the interior point: doing it here, while the hinges are
+        # still unsettled, costs many more solves.)
+        held = np.abs(before) == 1
+        terminal = before
+        if sub.tolerance > 0.0:
+            residual = sub.G @ point.d[-1] + sub.g
+            off = np.where(np.abs(residual) > sub.tolerance, np.sign(residual), 0).astype(np.int64)
+            turned = np.where(nu * before < 0.0, -before, before)
+            terminal = np.where(held, turned, np.where(before == 0, off, before))
+        return self._with_terminal(point, terminal)
+
+    def near(self, point: Point) -> _ActiveSet:
+        """Pieces the solution of the interior point lies on, or almost."""
+        sub, nu = self.sub, point.terminal
+        residual = np.abs(sub.G @ point.d[-1] + sub.g)
+        sign = np.where(nu < 0.0, -1, 1)
+        terminal = np.where(residual < sub.tolerance * (1.0 - _NEAR) - 1e-12, 0, sign)
+        terminal = np.where(residual > sub.tolerance + _NEAR, 2 * sign, terminal)
+        found = self._with_terminal(point, terminal)
+        if self.bounded:
+            margin = _NEAR * (1.0 + np.abs(point.e))
+            found.lower = point.e < sub.lower + margin
+            found.upper = point.e > sub.upper - margin
+        return found
+
+    def _with_terminal(self, point: Point, terminal: Array) -> _ActiveSet:
+        sub = self.sub
+        if self.bounded:
+            lower, upper = point.e < sub.lower, point.e > sub.upper
+        else:
+            lower = upper = np.zeros(sub.r.shape, dtype=bool)
+        return _ActiveSet(self.hinge_arguments(point.d) > 0.0, lower, upper, terminal)
+
+    def objective(self, point: Point) -> float:
+        """The objective with bounds as stiff penalties, for comparing points."""
+        sub = self.sub
+        d, e = point.d, point.e
+        hinge = np.maximum(self.hinge_arguments(d), 0.0)
+        value = 0.5 * np.vdot(e, np.matmul(sub.R, e[..., None])) + np.vdot(sub.r, e)
+        value += 0.5 * np.vdot(d, np.matmul(sub.Q, d[..., None])) + np.vdot(sub.q, d)
+        value += 0.5 * np.vdot(sub.h, hinge * hinge)
+        if self.bounded:
+            over = np.maximum(e - sub.upper, 0.0) + np.maximum(sub.lower - e, 0.0)
+            value += 0.5 * self.stiffness * np.vdot(over, over)
+        return float(value)
+
+    def replayed(self, point: Point) -> Point:
+        """The point with its controls clipped to their bounds and the states they lead to."""
+        e = np.clip(point.e, self.sub.lower, self.sub.upper)
+        return dataclasses.replace(point, d=self.sub.response(e), e=e)
+
+    def objective_of(self, point: Point) -> float:
+        """The sub-problem's own objective."""
+        return self.sub.objective(point.d, point.e)
+
+    def line_search(self, a: Point, b: Point) -> float:
+        """Step in (0, 1] that minimises :meth:`objective` from a towards b.
+
+        The derivative along the step is continuous, piecewise linear and increasing.
+        """
+        sub = self.sub
+        dd, de = b.d - a.d, b.e - a.e
+        R_de, Q_dd = np.matmul(sub.R, de[..., None]), np.matmul(sub.Q, dd[..., None])
+        linear = float(
+            np.vdot(sub.q, dd) + np.vdot(sub.r, de) + np.vdot(a.e, R_de) + np.vdot(a.d, Q_dd)
+        )
+        square = float(np.vdot(de, R_de) + np.vdot(dd, Q_dd))
+        c = self.hinge_arguments(a.d)
+        dc = self.hinge_arguments(b.d) - c
+
+        def slope(t: float) -> tuple[float, float]:
+            """Derivative along the step and, piecewise constant, its own derivative."""
+            argument = c + t * dc
+            push = sub.h * dc * (argument > 0.0)
+            value = linear + t * square + float(np.vdot(push, argument))
+            change = square + float(np.vdot(push, dc))
+            if self.bounded:
+                e = a.e + t * de
+                high, low = e - sub.upper, sub.lower - e
+                over = np.where(high > 0.0, high, np.where(low > 0.0, -low, 0.0))
+                value += self.stiffness * float(np.vdot(over, de))
+                change += self.stiffness * float(np.vdot((over != 0.0) * de, de))
+            return value, change
+
+        if slope(1.0)[0] <= 0.0:
+            return 1.0
+        # Newton on a piecewise linear increasing function, kept inside a shrinking bracket:
+        # it ends on the very piece that holds the zero.
+        low, high, t = 0.0, 1.0, 0.0
+        for _ in range(60):
+            value, change = slope(t)
+            if value > 0.0:
+                high = t
+            else:
+                low = t
+            guess = t - value / change if change > 0.0 else -1.0
+            new = guess if low < guess < high else 0.5 * (low + high)
+            if abs(new - t) <= 1e-14 * max(new, 1e-300):
+                return new
+            t = new
+        return high

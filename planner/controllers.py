@@ -1,0 +1,155 @@
+"""Plans as controllers, with the `predict` signature of Stable-Baselines3.
+
+A controller sees observations of an environment, on its own or in batches, and answers with
+actions. How an observation encodes (t, x) and an action a control is the problem's business:
+its `decode_observation` and `encode_control` are used when it has them; otherwise an
+observation is (x, t) and an action the control itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner.feedback import default_tracking, lqr_gains, weight_matrix
+from slipcar.planner.plan import Plan
+
+Array = np.ndarray
+
+
+class OpenLoop:
+    """Plays a plan's controls by the clock, whatever the state.
+
+    Attributes:
+        plan: what is played.
+        observation: the kind of observation it would rather be given.
+        closed_loop: False.
+    """
+
+    observation = "state"
+    closed_loop = False
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+
+    @property
+    def preparation_time(self) -> float:
+        """Seconds of planning."""
+        return self.plan.solve_time
+
+    @property
+    def status(self) -> Any:
+        """The plan's status."""
+        return self.plan.status
+
+    def control(self, t: Any, x: Any) -> Array:
+        """Control in physical units at times t (...,) [s] and states x (..., n): (..., m)."""
+        return self.plan.controls[self._interval(t)]
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Array, None]:
+        """Actions for observations (d,) or (batch, d): float32 (m,) or (batch, m), and None.
+
+        Raises:
+            ValueError: if the observation has the wrong length or is not finite.
+        """
+        t, x = self._decode(observation)
+        u = self.control(t, x)
+        encode = getattr(self.plan.problem, "encode_control", None)
+        return np.asarray(u if encode is None else encode(u), dtype=np.float32), None
+
+    def fingerprint(self) -> str:
+        """A hash of all that determines its actions."""
+        digest = hashlib.sha256(type(self).__name__.encode())
+        for array in self._numbers():
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def _numbers(self) -> list[Array]:
+        return [self.plan.times, self.plan.controls]
+
+    def _interval(self, t: Any) -> Array:
+        # Observations are float32, so a node's time may come back a little early.
+        times = self.plan.times
+        slack = 1e-3 * np.min(np.diff(times))
+        k = np.searchsorted(times, np.asarray(t) + slack, side="right") - 1
+        return np.clip(k, 0, len(times) - 2)
+
+    def _decode(self, observation: Any) -> tuple[Array, Array]:
+        observed = np.asarray(observation, dtype=np.float64)
+        if not np.isfinite(observed).all():
+            index = tuple(int(i) for i in np.argwhere(~np.isfinite(observed))[0])
+            raise ValueError(f"observation{list(index)} is {observed[index]}; it must be finite")
+        n = self.plan.mean.shape[1]
+        decode = getattr(self.plan.problem, "decode_observation", None)
+        if decode is not None:
+            return decode(observed)
+        if observed.ndim == 0 or observed.shape[-1] != n + 1:
+            raise ValueError(
+                f"an observation must hold the {n} states and the time on its last axis, not shape "
+                f"{observed.shape}; the plan's problem has no decode_observation"
+            )
+        return observed[..., n], observed[..., :n]
+
+
+class Feedback(OpenLoop):
+    """u = ū + K (x − μ): a plan with gains, clipped to the control bounds.
+
+    Plans that have `gains` use them. Otherwise they are those of the time-varying LQR around
+    the plan, min ∫ δxᵀQδx + δuᵀRδu dt + δx(T)ᵀQf δx(T), with R the problem's control weight.
+
+    Args:
+        plan: what to follow.
+        Q: weight on deviations: scalar, (n,) or (n, n); default diag(10, 10, 1, 1, 1) for five
+            states (SPEC §6), the identity otherwise.
+        R: weight on corrections; default the problem's control weight (or identity).
+        Qf: weight on the final deviation; default 100.
+
+    Raises:
+        ValueError: for a weight of wrong shape or sign, or gains of wrong shape.
+    """
+
+    closed_loop = True
+
+    def __init__(self, plan: Plan, Q: Any = None, R: Any = None, Qf: Any = 100.0) -> None:
+        n, m = plan.mean.shape[1], plan.controls.shape[1]
+        if plan.gains is None:
+            own = getattr(plan.problem, "control_weight", np.eye(m))
+            plan = plan.replace(
+                gains=lqr_gains(
+                    plan.A,
+                    plan.B,
+                    np.diff(plan.times),
+                    weight_matrix("Q", default_tracking(n) if Q is None else Q, n),
+                    weight_matrix("R", own if R is None else R, m),
+                    weight_matrix("Qf", Qf, n),
+                )
+            )
+        if plan.gains is None or plan.gains.shape != (len(plan.controls), m, n):
+            raise ValueError(
+                f"gains must have shape {(len(plan.controls), m, n)}, not {np.shape(plan.gains)}"
+            )
+        super().__init__(plan)
+        self._angles = tuple(getattr(plan.problem, "angles", ()))
+
+    def control(self, t: Any, x: Any) -> Array:
+        """Control in physical units at times t (...,) [s] and states x (..., n): (..., m)."""
+        k = self._interval(t)
+        error = np.asarray(x) - self.plan.mean[k]
+        for i in self._angles:  # observations know headings modulo 2π
+            error[..., i] -= 2.0 * np.pi * np.round(error[..., i] / (2.0 * np.pi))
+        assert self.plan.gains is not None
+        # A sum over states rather than a matrix product: the same bits for any batch size.
+        correction = (self.plan.gains[k] * error[..., None, :]).sum(axis=-1)
+        return self.plan.controls[k] + correction
+
+    def _numbers(self) -> list[Array]:
+        assert self.plan.gains is not None
+        return [*super()._numbers(), self.plan.mean, self.plan.gains]

@@ -1,0 +1,64 @@
+"""Time-varying LQR around a plan: gains that turn deviations from the mean into controls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray
+
+#: Weights on deviations from the mean for a five-state car (SPEC §6), the default when the
+#: plan has five states; otherwise the identity.
+_TRACKING = (10.0, 10.0, 1.0, 1.0, 1.0)
+
+
+def lqr_gains(A: Array, B: Array, dt: Array, Q: Array, R: Array, Qf: Array) -> Array:
+    """Gains of min Σ dt (δxᵀQδx + δuᵀRδu) + δx_NᵀQf δx_N along δx⁺ = A δx + B δu.
+
+    The backward Riccati recursion in Joseph's form, which keeps the cost to go symmetric
+    positive semidefinite.
+
+    Args:
+        A: (K, n, n).
+        B: (K, n, m).
+        dt: interval lengths, (K,) [s].
+        Q: (n, n), positive semidefinite; charged at nodes 1..K−1.
+        R: (m, m), positive definite.
+        Qf: (n, n), positive semidefinite.
+
+    Returns:
+        K with δu = K δx, (K, m, n).
+    """
+    K = np.empty((len(A), B.shape[2], A.shape[1]))
+    P = Qf
+    for k in range(len(A) - 1, -1, -1):
+        Rk = dt[k] * R
+        K[k] = -np.linalg.solve(Rk + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
+        closed = A[k] + B[k] @ K[k]
+        P = closed.T @ P @ closed + K[k].T @ Rk @ K[k] + (dt[k] * Q if k else 0.0)
+    return K
+
+
+def weight_matrix(name: str, value: Any, n: int) -> Array:
+    """A scalar, a diagonal (n,) or a matrix (n, n) as a matrix.
+
+    Raises:
+        ValueError: for another shape, a non-finite entry or a matrix that is not positive
+            semidefinite.
+    """
+    given = np.asarray(value, dtype=np.float64)
+    if given.ndim == 0:
+        given = given * np.eye(n)
+    elif given.shape == (n,):
+        given = np.diag(given)
+    if given.shape != (n, n):
+        raise ValueError(f"{name} must be a scalar, ({n},) or ({n}, {n}), not {given.shape}")
+    if not np.isfinite(given).all() or np.linalg.eigvalsh(0.5 * (given + given.T))[0] < -1e-12:
+        raise ValueError(f"{name} must be finite and positive semidefinite, not {value!r}")
+    return given
+
+
+def default_tracking(n: int) -> Array:
+    """Default Q on deviations, (n, n)."""
+    return np.diag(_TRACKING) if n == len(_TRACKING) else np.eye(n)

@@ -1,0 +1,24 @@
+"""How a plan ended: typed, so that no failure passes for an answer."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Status(enum.Enum):
+    """Outcome of `plan`; the value is a sentence."""
+
+    CONVERGED = "converged: successive controls agree and the terminal condition holds"
+    MAX_ITERATIONS = "stopped at max_iterations before the controls settled"
+    INFEASIBLE = "settled, but the terminal condition cannot be met (virtual control remains)"
+    STALLED = "stopped: no step within the trust region lowers the merit function"
+    SOLVER_FAILED = "stopped: the sub-problem solver did not find a solution"
+    STOPPED = "stopped by the callback"
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def ok(self) -> bool:
+        """Whether the plan is a converged one."""
+        return self is Status.CONVERGED
