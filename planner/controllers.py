@@ -120,23 +120,22 @@ class Feedback(OpenLoop):
 
     def __init__(self, plan: Plan, Q: Any = None, R: Any = None, Qf: Any = 100.0) -> None:
         n, m = plan.mean.shape[1], plan.controls.shape[1]
-        if plan.gains is None:
+        gains = plan.gains
+        if gains is None:
             own = getattr(plan.problem, "control_weight", np.eye(m))
-            plan = plan.replace(
-                gains=lqr_gains(
-                    plan.A,
-                    plan.B,
-                    np.diff(plan.times),
-                    weight_matrix("Q", default_tracking(n) if Q is None else Q, n),
-                    weight_matrix("R", own if R is None else R, m),
-                    weight_matrix("Qf", Qf, n),
-                )
+            gains = lqr_gains(
+                plan.A,
+                plan.B,
+                np.diff(plan.times),
+                weight_matrix("Q", default_tracking(n) if Q is None else Q, n),
+                weight_matrix("R", own if R is None else R, m),
+                weight_matrix("Qf", Qf, n),
             )
-        if plan.gains is None or plan.gains.shape != (len(plan.controls), m, n):
-            raise ValueError(
-                f"gains must have shape {(len(plan.controls), m, n)}, not {np.shape(plan.gains)}"
-            )
-        super().__init__(plan)
+        gains = np.asarray(gains, dtype=np.float64)
+        wanted = (len(plan.controls), m, n)
+        if gains.shape != wanted or not np.isfinite(gains).all():
+            raise ValueError(f"gains must be finite and of shape {wanted}, not {gains.shape}")
+        super().__init__(plan.replace(gains=gains))
         self._angles = tuple(getattr(plan.problem, "angles", ()))
 
     def control(self, t: Any, x: Any) -> Array:

@@ -101,14 +101,17 @@ def variance_penalty(
     )
 
 
-def trust_region_weight(error_variance: Variance, dt: Array) -> Array:
+def trust_region_weight(hessian: Array, dt: Array) -> Array:
     """Hessian of ∫ E‖x − x_k‖² dt = ∫ ‖μᵉ‖² + tr Σᵉ dt at nodes 1..K, (K, n, n).
 
     Both paths see the same Brownian motion, so to first order the error's diffusion is
     σ′ (x − x_k): ∫ tr Σᵉ is the quadratic part of the variance penalty with weight one
     (SPEC §3.4).
+
+    Args:
+        hessian: of the variance penalty with weight one at nodes 0..K−1, (K, n, n).
+        dt: (K,).
     """
-    n = error_variance.hessian.shape[1]
-    W = 2.0 * dt[:, None, None] * np.eye(n)
-    W[:-1] += error_variance.hessian[1:]
+    W = 2.0 * dt[:, None, None] * np.eye(hessian.shape[1])
+    W[:-1] += hessian[1:]
     return W

@@ -278,13 +278,12 @@ def _solve(
 
 
 def _trust_weight(model: Model, settings: Settings, at: _Iterate) -> Array:
-    if at.variance is not None:  # the same quadratic, but for its weight
-        w = settings.variance_weight
-        unit = dataclasses.replace(at.variance, hessian=at.variance.hessian / w)
-    else:
-        unit = _variance(model, at.lin, 1.0)
-    assert unit is not None
-    return moments.trust_region_weight(unit, model.dt)
+    # The variance penalty is the same quadratic, but for its weight.
+    variance, weight = at.variance, settings.variance_weight
+    if variance is None:
+        variance, weight = _variance(model, at.lin, 1.0), 1.0
+    assert variance is not None
+    return moments.trust_region_weight(variance.hessian / weight, model.dt)
 
 
 def _merit(settings: Settings, at: _Iterate, found: Solution, rho: float) -> float:

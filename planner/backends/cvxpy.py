@@ -44,11 +44,11 @@ class CvxpySolver:
             argument = cp.sum(cp.multiply(sub.a[:, i], d), axis=1) + sub.b[:, i]
             cost += 0.5 * cp.sum_squares(cp.multiply(np.sqrt(sub.h[:, i]), cp.pos(argument)))
 
-        before = np.zeros(n)  # A_0 d_0: the start is fixed
+        before = [np.zeros(n)]  # A_0 d_0: the start is fixed
         if K > 1:
-            before = cp.hstack([before, sparse.block_diag(list(sub.A[1:])) @ flat_d[:-n]])
+            before.append(sparse.block_diag(list(sub.A[1:])) @ flat_d[:-n])
         response = sparse.block_diag(list(sub.B)) @ flat_e + sub.f.ravel()
-        dynamics = flat_d == before + response
+        dynamics = flat_d == cp.hstack(before) + response
         residual = sub.G @ d[K - 1] + sub.g - slack
         terminal = residual == 0 if sub.tolerance == 0.0 else cp.norm_inf(residual) <= sub.tolerance
         constraints = [dynamics, terminal]
@@ -62,18 +62,18 @@ class CvxpySolver:
             problem.solve(solver=self.solver, **_SOLVERS.get(self.solver, {}))
         except cp.SolverError as error:
             return failed(sub, 0, f"{self.solver}: {error}")
-        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or d.value is None:
             return failed(sub, 0, f"{self.solver}: {problem.status}")
-        stats = problem.solver_stats
+        deviations, corrections = np.asarray(d.value), np.asarray(e.value)
         adjoint = -np.asarray(dynamics.dual_value).reshape(K, n)
         return Solution(
             found=problem.status == cp.OPTIMAL,
-            d=d.value,
-            e=e.value,
+            d=deviations,
+            e=corrections,
             adjoint=adjoint,
-            terminal=_terminal_multiplier(sub, adjoint, d.value),
-            objective=sub.objective(d.value, e.value),
-            iterations=int(stats.num_iters or 0),
+            terminal=_terminal_multiplier(sub, adjoint, deviations),
+            objective=sub.objective(deviations, corrections),
+            iterations=int(problem.solver_stats.num_iters or 0),
             message="" if problem.status == cp.OPTIMAL else f"{self.solver}: inaccurate",
         )
 

@@ -174,10 +174,7 @@ def _direction(
     dc = np.matmul(sub.a, (target.d - point.d)[..., None])[..., 0]
     dt = (rest + g1 * dc) / D
     dnu = target.terminal - point.terminal
-    if sub.tolerance > 0.0:
-        dw = target.terminal / W + lean
-    else:
-        dw = np.zeros_like(w)
+    dw = target.terminal / W + lean if sub.tolerance > 0.0 else np.zeros_like(w)
     dplus = (mu + p.plus * dnu) / p.z_plus - p.plus
     dminus = (mu - p.minus * dnu) / p.z_minus - p.minus
     # The larger slack follows from the condition itself: its multiplier ρ ∓ ν is a small

@@ -150,7 +150,7 @@ class _Pattern:
 
     def fill(self, sub: Subproblem, *, slack: bool) -> tuple[Array, Array, Array, Array, Array]:
         """P and A data, q, lower and upper limits; the terminal slacks open or held at 0."""
-        K, n, m, p, q = self.shape
+        K, _, _, p, q = self.shape
         P = [
             sub.Q[:, self.upper_n[0], self.upper_n[1]],
             sub.R[:, self.upper_m[0], self.upper_m[1]],
@@ -161,7 +161,7 @@ class _Pattern:
         linear[self.plus] = linear[self.minus] = sub.rho if slack else 0.0
         one_q, one_hinge = np.ones(q), np.ones((K, p))
         A = [
-            np.ones((K, n)),
+            np.ones(sub.f.shape),
             -sub.A[1:],
             -sub.B,
             sub.G,
