@@ -1,0 +1,79 @@
+"""The command line, `slipcar compare|plan|simulate|train`: each a thin call of a function.
+
+Bad values end in one line on the standard error and exit code 2; a plan that did not converge
+or a row that failed in exit code 1; an interruption in 130.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+
+#: name -> (module, function, what `slipcar --help` says). Imported when asked for, because
+#: help should not take a second.
+COMMANDS = {
+    "compare": ("cli_compare", "compare", "the table and figures: SCP, feedback and PPO"),
+    "plan": ("cli_plan", "plan", "plan one scenario and print how the iteration went"),
+    "simulate": ("cli_simulate", "simulate", "drive a few episodes; show, draw or film them"),
+    "train": ("cli_train", "train", "train the PPO baseline on a scenario"),
+}
+_DESCRIPTION = """Stochastic SCP, a slipping car, and an honest comparison with PPO.
+
+    slipcar compare                      the paper's scenario, five controllers, figures
+    slipcar plan --figure plan.png       one plan, in milliseconds
+    slipcar COMMAND --help               every option of a command"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments without the program's name; None takes the process's.
+
+    Returns:
+        The exit code.
+    """
+    import tyro
+
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        if arguments and arguments[0] in COMMANDS:
+            command = _command(arguments[0])
+            prog = f"slipcar {arguments[0]}"
+            return int(tyro.cli(command, prog=prog, args=arguments[1:]) or 0)
+        # Help, or nothing that is a command: tyro says which there are.
+        summaries = {name: _summary(text) for name, (_, _, text) in COMMANDS.items()}
+        tyro.extras.subcommand_cli_from_dict(
+            summaries, prog="slipcar", description=_DESCRIPTION, args=arguments
+        )
+    except SystemExit as stop:  # tyro has printed help (0) or what is wrong (2)
+        return int(stop.code or 0)
+    except KeyboardInterrupt as stop:
+        print(f"slipcar: interrupted{f': {stop}' if str(stop) else ''}", file=sys.stderr)
+        return 130
+    except (ValueError, OSError, ImportError) as error:
+        print(f"slipcar {arguments[0]}: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _command(name: str) -> Callable[..., int]:
+    module, function, _ = COMMANDS[name]
+    return getattr(importlib.import_module(f"slipcar.evaluation.{module}"), function)
+
+
+def _summary(text: str) -> Callable[[], None]:
+    def summary() -> None:
+        pass
+
+    summary.__doc__ = text
+    return summary
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,105 @@
+"""What the command line's words mean: scenarios and controllers by name or by file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from slipcar.envs.scenario import Scenario
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from slipcar.evaluation.rollout import Controller
+
+_SCENARIO_HELP = (
+    "which world: one of "
+    + ", ".join(Scenario.names())
+    + "; random:SEED for a drawn one; or a .json file that Scenario.to_json wrote"
+)
+#: A scenario, as an option; and one that may be left to the controller.
+ScenarioOption = Annotated[str, tyro.conf.arg(metavar="NAME|FILE", help=_SCENARIO_HELP)]
+OwnScenarioOption = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME|FILE",
+        help=_SCENARIO_HELP + "; by default the one a stored plan or a policy was made for, "
+        "and paper for the others",
+    ),
+]
+
+CONTROLLERS = ("scp", "feedback", "deterministic", "straight", "ppo")
+
+
+def read_scenario(text: str) -> Scenario:
+    """The scenario that a word of the command line means.
+
+    Raises:
+        ValueError: for an unknown name, a bad seed or a file that is no scenario.
+        OSError: if the file cannot be read.
+    """
+    if text.endswith(".json"):
+        return Scenario.from_json(Path(text).read_text(encoding="utf-8"))
+    kind, colon, seed = text.partition(":")
+    if kind == "random" and colon:
+        if not seed.isdecimal():
+            raise ValueError(f"random:SEED needs a whole number >= 0, not {seed!r}")
+        return Scenario.random(int(seed))
+    if text not in Scenario.names():
+        raise ValueError(
+            f"unknown scenario {text!r}: it is one of {Scenario.names()}, random:SEED, or a "
+            ".json file"
+        )
+    return Scenario.named(text)
+
+
+def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, Scenario]:
+    """The controller that a word of the command line means, and the scenario it is to drive.
+
+    Args:
+        text: one of :data:`CONTROLLERS`, a plan's .npz file, or a policy's .safetensors or
+            .json file or folder.
+        scenario: where it drives; None is the one a stored plan or a policy was made for, and
+            the paper's for the others.
+
+    Raises:
+        ValueError: for an unknown word or a bad file.
+        OSError: if the file cannot be read.
+    """
+    from slipcar import baselines
+    from slipcar.planner import Feedback, OpenLoop, Plan, plan
+
+    path = Path(text)
+    if text == "ppo" or path.suffix in (".safetensors", ".json") or path.is_dir():
+        policy = baselines.load_policy(None if text == "ppo" else path)
+        return policy, scenario or policy.scenario
+    if path.suffix == ".npz":
+        stored = Plan.load(path)
+        made_for = stored.problem if isinstance(stored.problem, Scenario) else None
+        world = scenario or made_for or Scenario.named("paper")
+        # A plan plays its own controls; the world it is played in says how actions scale.
+        stored = stored.replace(problem=world)
+        return (OpenLoop(stored) if stored.gains is None else Feedback(stored)), world
+    world = scenario or Scenario.named("paper")
+    if text == "scp":
+        return OpenLoop(plan(world)), world
+    if text == "feedback":
+        return Feedback(plan(world)), world
+    if text == "deterministic":
+        return OpenLoop(baselines.deterministic_scp(world)), world
+    if text == "straight":
+        return baselines.straight(world), world
+    raise ValueError(
+        f"unknown controller {text!r}: it is one of {list(CONTROLLERS)}, a plan's .npz file, or a "
+        "policy's .safetensors file or folder"
+    )
+
+
+def console(width: int = 120) -> Console:
+    """Where tables go: at least `width` columns if the output is a file or a pipe."""
+    from rich.console import Console
+
+    out = Console(highlight=False)
+    return out if out.is_terminal else Console(highlight=False, width=max(width, out.width))

@@ -1,0 +1,133 @@
+"""Figures of a whole comparison: cost against collisions, and how the cost is distributed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from slipcar.evaluation.plot_scene import PALETTE, PAPER, new_figure, style
+from slipcar.evaluation.statistics import CONFIDENCE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from slipcar.evaluation.compare import Comparison
+    from slipcar.evaluation.metrics import Result
+
+_MARKERS = "osD^vPX*"
+#: Rows that cost more than this many times the cheapest are named beside the axes, not drawn:
+#: they would press all others into a corner.
+OFF_AXES = 5.0
+
+
+def _looks(comparison: Comparison) -> dict[str, dict[str, Any]]:
+    """Colour, marker and label of each finished row; filled and solid where the loop is closed."""
+    results = comparison.results
+    cheapest = min(result.total for result in results.values())
+    looks = {}
+    for i, (name, result) in enumerate(results.items()):
+        colour = PALETTE[i % len(PALETTE)]
+        loop = "closed loop" if result.closed_loop else "open loop"
+        looks[name] = {
+            "colour": colour,
+            "marker": _MARKERS[i % len(_MARKERS)],
+            "face": colour if result.closed_loop else PAPER,
+            "line": "-" if result.closed_loop else (0, (4, 2)),
+            "label": name if loop in name.lower() else f"{name}, {loop}",
+            "drawn": result.total <= OFF_AXES * cheapest,
+        }
+    return looks
+
+
+def _off_axes_label(label: str, result: Result) -> str:
+    cost = f"{result.total:,.0f}" if result.total >= 100.0 else f"{result.total:.3g}"
+    return f"{label}, off the axes:\ncost {cost}, collisions {result.collision_rate:.1%}"
+
+
+def tradeoff_figure(comparison: Comparison) -> Figure:
+    """Total cost against collision rate, with 95 % intervals of both."""
+    with style():
+        figure = new_figure(6.4, 4.3)
+        axes = figure.subplots()
+        for name, look in _looks(comparison).items():
+            result = comparison.results[name]
+            rate, at = result.collision_rate, 100.0 * result.collision_rate
+            low, high = (100.0 * end for end in result.collision_interval)
+            label, marker = look["label"], look["marker"]
+            if rate == 0.0:
+                # Nothing observed has no place on a logarithmic axis: it is shown at the
+                # interval's upper end, pointing left.
+                at = low = high
+                marker, label = "<", f"{label}: none observed"
+            if not look["drawn"]:
+                label, marker, at = _off_axes_label(look["label"], result), look["marker"], np.nan
+            axes.plot(
+                at,
+                result.total if look["drawn"] else np.nan,
+                marker=marker,
+                color=look["colour"],
+                markerfacecolor=look["face"],
+                markeredgewidth=1.5,
+                markersize=7.5,
+                linestyle="none",
+                zorder=4,
+                label=label,
+            )
+            if look["drawn"]:
+                axes.errorbar(
+                    at,
+                    result.total,
+                    xerr=[[max(at - low, 0.0)], [max(high - at, 0.0)]],
+                    yerr=1.96 * np.nan_to_num(result.total_se),
+                    color=look["colour"],
+                    fmt="none",
+                    capsize=3.0,
+                    elinewidth=1.2,
+                    zorder=3,
+                )
+        axes.set_xscale("log")
+        axes.margins(0.12)
+        _plain_log_ticks(axes.xaxis)
+        axes.set_xlabel(f"collision rate [%], Wilson {CONFIDENCE:.0%} interval")
+        axes.set_ylabel(f"mean cost of a path, {CONFIDENCE:.0%} interval")
+        axes.legend(loc="best", title="filled: closed loop, hollow: open loop", alignment="left")
+    return figure
+
+
+def _plain_log_ticks(axis: Any) -> None:
+    """1, 2, 5, 10 … instead of powers, over the decade or two that is shown."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def distributions_figure(comparison: Comparison) -> Figure:
+    """How the cost of a path is distributed: its distribution function, and its tail."""
+    with style():
+        figure = new_figure(9.0, 3.9)
+        left, right = figure.subplots(1, 2, sharex=True)
+        for name, look in _looks(comparison).items():
+            result = comparison.results[name]
+            line = {"color": look["colour"], "linestyle": look["line"], "linewidth": 1.6}
+            if not look["drawn"]:
+                left.plot([], [], label=_off_axes_label(look["label"], result), **line)
+                continue
+            costs = np.sort(result.metrics.total)
+            share = np.arange(1, len(costs) + 1) / len(costs)
+            left.step(costs, share, where="post", label=look["label"], **line)
+            # Just before each jump, so that the largest cost is still on the axis.
+            right.step(costs, 1.0 - share + 1.0 / len(costs), where="pre", **line)
+        left.set_ylabel("share of episodes that cost at most $c$")
+        left.set_ylim(0.0, 1.0)
+        right.set_ylabel("share of episodes that cost at least $c$")
+        right.set_yscale("log")
+        for axes in (left, right):
+            axes.set_xscale("log")
+            _plain_log_ticks(axes.xaxis)
+            axes.set_xlabel("cost of a path $c$")
+        figure.legend(
+            *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, handlelength=2.6
+        )
+    return figure

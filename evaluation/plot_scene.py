@@ -1,0 +1,151 @@
+"""The look of every figure, and the world seen from above."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from slipcar.envs.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Okabe and Ito's palette: told apart by colour-blind readers too.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F3C8D", "#000000")
+INK, GREY, PAPER = "#222222", "#8A8A8A", "#FFFFFF"
+OBSTACLE = "#C9CDD3"
+
+_STYLE: Any = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.labelsize": 9.0,
+    "legend.fontsize": 8.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "mathtext.fontset": "dejavusans",
+    "axes.edgecolor": INK,
+    "axes.linewidth": 0.7,
+    "lines.linewidth": 1.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 0.6,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.frameon": True,
+    "legend.framealpha": 0.85,
+    "legend.edgecolor": "none",
+    "figure.facecolor": PAPER,
+    "pdf.fonttype": 42,  # TrueType: text stays text in the PDF
+}
+
+
+@contextlib.contextmanager
+def style() -> Iterator[None]:
+    """The house style, for the figures made inside; the user's settings are left alone."""
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure without pyplot: no window, no global state, nothing to close."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write PNG (150 dpi) and PDF; without dates, so that equal figures are equal files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
+    with style():
+        figure.savefig(paths[0], dpi=150)
+        figure.savefig(paths[1], metadata={"CreationDate": None})
+    return paths
+
+
+def draw_scene(axes: Axes, scenario: Scenario) -> None:
+    """Obstacles with their clearance rings, start and goal, axes in metres."""
+    for i, (x, y, radius) in enumerate(scenario.obstacles):
+        axes.add_patch(
+            Circle(
+                (x, y),
+                radius,
+                facecolor=OBSTACLE,
+                edgecolor=GREY,
+                linewidth=0.8,
+                zorder=2,
+                label="obstacle" if i == 0 else None,
+            )
+        )
+        axes.add_patch(
+            Circle(
+                (x, y),
+                radius + scenario.clearance,
+                fill=False,
+                edgecolor=GREY,
+                linewidth=0.7,
+                linestyle=(0, (4, 3)),
+                zorder=2,
+                label="clearance" if i == 0 else None,
+            )
+        )
+    for state, marker, label in ((scenario.start, "o", "start"), (scenario.goal, "*", "goal")):
+        axes.plot(
+            *state[:2],
+            marker=marker,
+            markersize=7 if marker == "o" else 13,
+            markerfacecolor=PAPER if marker == "o" else PALETTE[4],
+            markeredgecolor=INK,
+            markeredgewidth=0.9,
+            linestyle="none",
+            zorder=8,
+            label=label,
+        )
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("$r_x$ [m]")
+    axes.set_ylabel("$r_y$ [m]")
+
+
+def draw_paths(axes: Axes, states: np.ndarray, **line: Any) -> LineCollection:
+    """Paths (paths, N, >= 2) as thin lines."""
+    options = {"colors": GREY, "linewidths": 0.5, "alpha": 0.35, "zorder": 3, **line}
+    collection = LineCollection(list(states[..., :2]), **options)
+    axes.add_collection(collection)
+    axes.autoscale_view()
+    return collection
+
+
+def paths_figure(scenario: Scenario, states: np.ndarray, title: str) -> Figure:
+    """Sample paths of a controller, those that hit an obstacle picked out.
+
+    Args:
+        scenario: the world.
+        states: (paths, N, 5).
+        title: above the axes.
+    """
+    with style():
+        figure = new_figure(5.2, 5.0)
+        axes = figure.subplots()
+        draw_scene(axes, scenario)
+        hit = (scenario.signed_distance(states[:, 1:]) < 0.0).any(axis=1)
+        kinds = ((~hit, PALETTE[0], "free"), (hit, PALETTE[1], "hits an obstacle"))
+        for which, colour, label in kinds:
+            if which.any():
+                alpha = float(np.clip(15.0 / which.sum(), 0.15, 0.9))
+                draw_paths(axes, states[which], colors=colour, alpha=alpha, linewidths=0.8)
+                axes.plot([], [], color=colour, label=f"{label} ({which.sum()})")
+        axes.set_title(title, loc="left")
+        axes.legend(loc="best")
+    return figure

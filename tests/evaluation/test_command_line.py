@@ -1,0 +1,184 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from slipcar.envs import Scenario
+from slipcar.evaluation.cli import COMMANDS, main
+from slipcar.evaluation.cli_inputs import read_controller, read_scenario
+from slipcar.planner import Feedback, OpenLoop, Plan, plan
+
+
+def test_help_teaches(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in COMMANDS)
+    options = {
+        "compare": ["--episodes", "--seed", "--folder", "--workers", "--policy", "--no-resume"],
+        "plan": ["--variance-weight", "--solver", "--tolerance", "--save", "--figure"],
+        "simulate": ["--gif", "--frames", "--human", "feedback", "straight", "ppo"],
+        "train": ["--total-steps", "--learning-rate", "--folder", "--seed"],
+    }
+    for name, expected in options.items():
+        assert main([name, "--help"]) == 0
+        text = capsys.readouterr().out
+        assert f"slipcar {name}" in text  # an example
+        for option in expected:
+            assert option in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["plan", "--scenario", "moon"], "unknown scenario 'moon'"),
+        (["plan", "--scenario", "random:x"], "random:SEED needs a whole number"),
+        (["plan", "--scenario", "nowhere.json"], "nowhere.json"),
+        (["plan", "--variance-weight", "-1"], "variance_weight must be finite and >= 0"),
+        (["plan", "--save", "plan.txt"], "ends in .npz"),
+        (["plan", "--figure", "plan.docx"], "ends in .png, .pdf or .svg"),
+        (["simulate", "uber"], "unknown controller 'uber'"),
+        (["simulate", "missing.npz"], "missing.npz"),
+        (["simulate", "scp", "--episodes", "0"], "episodes must be at least 1, not 0"),
+        (["simulate", "scp", "--episodes", "51", "--gif", "a.gif"], "at most 50"),
+        (["simulate", "scp", "--gif", "a.mp4"], "ends in .gif"),
+        (["compare", "--policy", "missing"], "missing"),
+        (["train", "--learning-rate", "-1"], "learning_rate"),
+        (["train", "--minibatches", "3"], "minibatches must divide"),
+    ],
+)
+def test_bad_values_are_one_line_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_errors_of_our_own_are_one_line(capsys):
+    main(["plan", "--scenario", "moon"])
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [[], ["drive"], ["plan", "--tolerance", "small"], ["--x"]])
+def test_unknown_words_are_exit_code_2(arguments, capsys):
+    assert main(arguments) == 2
+    assert capsys.readouterr().err
+
+
+def test_plan_prints_saves_and_draws(tmp_path, capsys):
+    saved, figure = tmp_path / "a" / "plan.npz", tmp_path / "plan.svg"
+    assert main(["plan", "--save", str(saved), "--figure", str(figure)]) == 0
+    text = capsys.readouterr().out
+    expected = plan(Scenario.named("paper"))
+    assert "CONVERGED" in text
+    assert f"effort {expected.effort:.6f}" in text
+    assert f"{expected.iterations} iterations" in text
+    np.testing.assert_array_equal(Plan.load(saved).controls, expected.controls)
+    assert "<svg" in figure.read_text(encoding="utf-8")
+
+
+def test_a_plan_that_does_not_converge_is_exit_code_1(capsys):
+    assert main(["plan", "--max-iterations", "1"]) == 1
+    assert "MAX_ITERATIONS" in capsys.readouterr().out
+
+
+def test_simulate_prints_each_episode(capsys):
+    from slipcar.evaluation import evaluate
+
+    assert main(["simulate", "scp", "--episodes", "3", "--seed", "4"]) == 0
+    text = capsys.readouterr().out
+    paper = Scenario.named("paper")
+    for total in evaluate(OpenLoop(plan(paper)), paper, 3, seed=4).metrics.total:
+        assert f"{total:.3f}" in text
+
+
+def test_simulate_draws_and_films(tmp_path):
+    pytest.importorskip("pygame")
+    pytest.importorskip("matplotlib")
+    from PIL import Image
+
+    figure, gif, frames = tmp_path / "p.png", tmp_path / "p.gif", tmp_path / "frames"
+    arguments = ["--scenario", "open", "--episodes", "1", "--figure", str(figure)]
+    assert (
+        main(["simulate", "straight", *arguments, "--gif", str(gif), "--frames", str(frames)]) == 0
+    )
+    assert figure.read_bytes()[:4] == b"\x89PNG"
+    shown = Image.open(gif)
+    pictures = sorted(frames.iterdir())
+    assert len(pictures) > 41  # every node, and a pause at the end
+    assert shown.n_frames >= 41
+    assert shown.size == Image.open(pictures[0]).size
+
+
+def test_a_stored_plan_drives_the_scenario_it_was_made_for(tmp_path, monkeypatch):
+    slalom = Scenario.named("slalom")
+    found = plan(slalom)
+    found.save(tmp_path / "open.npz")
+    Feedback(found).plan.save(tmp_path / "closed.npz")
+    blind, world = read_controller(str(tmp_path / "open.npz"), slalom)
+    assert type(blind) is OpenLoop
+    assert world == slalom
+    tracked, _ = read_controller(str(tmp_path / "closed.npz"), slalom)
+    assert type(tracked) is Feedback
+    assert tracked.fingerprint() == Feedback(found).fingerprint()
+
+
+def test_compare_end_to_end(tmp_path, capsys, monkeypatch, replay):
+    paper = Scenario.named("paper")
+    monkeypatch.setattr("slipcar.baselines.load_policy", lambda path=None: driver)
+    driver = replay(paper, (0.1, 0.0))
+    driver.scenario = paper
+    arguments = ["compare", "--episodes", "200", "--folder", str(tmp_path), "--no-figures"]
+    assert main(arguments) == 0
+    text = capsys.readouterr().out
+    assert "PPO" in text
+    assert "table.md" in text
+    data = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert data["episodes"] == 200
+    assert data["reference"] == "stochastic SCP"
+    assert main([*arguments, "--scenario", "open"]) == 0
+    assert "No PPO row" in capsys.readouterr().out
+
+
+def test_an_interrupted_compare_says_where_its_rows_are(tmp_path, capsys, monkeypatch, replay):
+    class Interrupts:
+        scenario = Scenario.named("paper")
+
+        def predict(self, *arguments, **rest):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("slipcar.baselines.load_policy", lambda path=None: Interrupts())
+    arguments = ["compare", "--episodes", "100", "--folder", str(tmp_path)]
+    assert main(arguments) == 130
+    assert f"finished rows are kept in {tmp_path}" in capsys.readouterr().err
+    assert len(list((tmp_path / "rows").glob("*.npz"))) == 4
+
+
+def test_scenarios_by_name_seed_and_file(tmp_path):
+    assert read_scenario("gap") == Scenario.named("gap")
+    assert read_scenario("random:7") == Scenario.random(7)
+    path = tmp_path / "mine.json"
+    path.write_text(Scenario.random(3).to_json(), encoding="utf-8")
+    assert read_scenario(str(path)) == Scenario.random(3)
+
+
+def test_importing_is_light():
+    code = (
+        "import sys, slipcar.evaluation, slipcar.evaluation.cli;"
+        "heavy = {'torch', 'matplotlib', 'pandas', 'stable_baselines3', 'pygame', 'cvxpy', 'osqp'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_python_m_runs_the_command_line():
+    done = subprocess.run(
+        [sys.executable, "-m", "slipcar.evaluation", "plan", "--scenario", "moon"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "unknown scenario 'moon'" in done.stderr

@@ -1,0 +1,100 @@
+"""The paper's case, planned and driven: numbers that were measured elsewhere (SPEC §4, §6)."""
+
+import numpy as np
+import pytest
+
+from slipcar.evaluation import compare, evaluate, sample_paths
+from slipcar.evaluation.compare import solver_failures
+from slipcar.planner import Feedback, OpenLoop, plan
+
+
+@pytest.fixture(scope="module")
+def paper():
+    from slipcar.envs import Scenario
+
+    return Scenario.named("paper")
+
+
+@pytest.fixture(scope="module")
+def deterministic(paper):
+    return plan(paper, variance_weight=0.0)
+
+
+def test_without_slip_a_path_costs_what_the_plan_says(paper, deterministic):
+    dry = paper.replace(slip=(0.0, 0.0))
+    r = evaluate(OpenLoop(deterministic), dry, 10)
+    # Actions travel as float32; the goal is reached to that precision.
+    assert r.effort == pytest.approx(deterministic.effort, rel=1e-6)
+    assert r.obstacle == pytest.approx(deterministic.obstacle_cost, rel=1e-3)
+    assert r.total == pytest.approx(deterministic.cost, abs=1e-4)
+    assert r.goal < 1e-6
+    assert r.collision_rate == 0.0
+
+
+def test_deterministic_scp_in_open_loop(paper, deterministic):
+    r = evaluate(OpenLoop(deterministic), paper, 100_000, seed=0)
+    assert r.effort == pytest.approx(4.398, abs=0.002)
+    assert 0.057 <= r.collision_rate <= 0.062
+    assert r.collision_interval[0] <= 0.0596 <= r.collision_interval[1]
+    assert r.position_rms == pytest.approx(0.152, abs=0.001)
+    assert r.total == pytest.approx(6.92, abs=0.03)
+    assert r.obstacle == pytest.approx(0.205, abs=0.004)
+
+
+def test_tracking_the_plan(paper, deterministic):
+    r = evaluate(Feedback(deterministic), paper, 30_000, seed=1)
+    assert r.total == pytest.approx(5.06, abs=0.02)
+    assert r.collision_rate == pytest.approx(0.010, abs=0.0025)
+    assert r.position_rms == pytest.approx(0.060, abs=0.001)
+    assert r.closed_loop
+
+
+def test_predicted_covariance_is_that_of_the_paths(paper):
+    found = plan(paper)
+    states, _ = sample_paths(OpenLoop(found), paper, 30_000, seed=2)
+    variance = states.var(axis=0)
+    integral = (variance[1:].sum(axis=-1) * paper.dt).sum()
+    assert found.variance == pytest.approx(integral, rel=0.03)
+    np.testing.assert_allclose(variance[-1, :2], np.diagonal(found.covariance[-1])[:2], rtol=0.04)
+
+
+def test_rows_of_the_real_controllers_do_not_depend_on_batches(paper, deterministic):
+    for controller in (OpenLoop(deterministic), Feedback(deterministic)):
+        whole = evaluate(controller, paper, 3000, seed=5).metrics.total
+        parts = evaluate(controller, paper, 3000, seed=5, batch_size=1).metrics.total
+        workers = evaluate(controller, paper, 3000, seed=5, n_jobs=2).metrics.total
+        np.testing.assert_array_equal(whole, parts)
+        np.testing.assert_array_equal(whole, workers)
+
+
+def test_a_plan_that_did_not_converge_is_seen_in_the_table(paper):
+    unfinished = plan(paper, max_iterations=1)
+    assert not unfinished.status.ok
+    assert solver_failures(OpenLoop(unfinished)) == 1
+    c = compare({"good": OpenLoop(plan(paper)), "bad": OpenLoop(unfinished)}, paper, 100,
+                progress=False)  # fmt: skip
+    assert c.frame["failures"].tolist() == [0, 1]
+
+
+def test_default_rows(paper, replay):
+    from slipcar.evaluation.rows import DETERMINISTIC, FEEDBACK, REFERENCE, STRAIGHT, default_rows
+
+    rows, notes = default_rows(paper, policy=replay(paper, (0.0, 0.0)))
+    assert notes == []
+    loops = {name: getattr(controller, "closed_loop", True) for name, controller in rows.items()}
+    assert list(loops.values()) == [False, False, False, True, False]
+    c = compare(rows, paper, 2000, reference=REFERENCE, progress=False)
+    assert not c.errors
+    rate = c.frame["collision_rate"]
+    assert rate[STRAIGHT] > rate[DETERMINISTIC] > rate[FEEDBACK]
+    assert c.frame.loc[FEEDBACK, "total_difference_high"] < 0.0
+
+
+def test_default_rows_speak_of_plans_that_failed(paper, replay):
+    from slipcar.evaluation.rows import default_rows
+
+    # Nearly four metres in half a second: not within these bounds.
+    hopeless = paper.replace(horizon=0.5)
+    _, notes = default_rows(hopeless, policy=replay(hopeless, (0.0, 0.0)))
+    assert len(notes) >= 1
+    assert "the plan is" in notes[0]
