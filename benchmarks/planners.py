@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from slipcar.envs import Scenario
-from slipcar.planner import plan
+from slipcar.planner import Plan, plan
+from slipcar.planner.backends import Solver
+from slipcar.planner.backends.structured import StructuredSolver
 
 
 def _time(call: Callable[[], Any], seconds: float) -> tuple[np.ndarray, Any]:
@@ -42,17 +44,28 @@ def rows(seconds: float = 2.0) -> list[dict[str, Any]]:
             }
         )
 
-    for solver in ("structured", "osqp", "cvxpy"):
-        for weight in (0.0, 1.0) if solver == "structured" else (0.0,):
-            try:
-                times, p = _time(
-                    lambda s=solver, w=weight: plan(scenario, solver=s, variance_weight=w), seconds
-                )
-            except ImportError as error:
-                print(f"skipped {solver}: {error}")
-                continue
-            name = f"slipcar {solver}, w = {weight:g}"
-            add(name, times, p.cost, p.iterations, str(p.status))
+    def structured(compiled: bool) -> Callable[[], Solver]:
+        return lambda: StructuredSolver(compiled)
+
+    solvers: list[tuple[str, Callable[[], str | Solver], float]] = [
+        ("slipcar structured (NumPy/SciPy), w = 0", structured(False), 0.0),
+        ("slipcar structured (NumPy/SciPy), w = 1", structured(False), 1.0),
+        ("slipcar structured (numba), w = 0", structured(True), 0.0),
+        ("slipcar structured (numba), w = 1", structured(True), 1.0),
+        ("slipcar osqp, w = 0", lambda: "osqp", 0.0),
+        ("slipcar cvxpy, w = 0", lambda: "cvxpy", 0.0),
+    ]
+    for name, make, weight in solvers:
+
+        def call(make: Callable[[], str | Solver] = make, weight: float = weight) -> Plan:
+            return plan(scenario, solver=make(), variance_weight=weight)
+
+        try:
+            times, p = _time(call, seconds)
+        except ImportError as error:
+            print(f"skipped {name}: {error}")
+            continue
+        add(name, times, p.cost, p.iterations, str(p.status))
     try:
         from casadi_nlp import CasadiNlp
     except ImportError as error:

@@ -38,8 +38,8 @@ def main() -> None:
     ours = {row["planner"]: row["ms (median)"] for row in next(iter(tables.values()))}
     ipopt = ours.get("CasADi + IPOPT, whole NLP")
     if ipopt is not None:
-        ratio = ipopt / ours["slipcar structured, w = 0"]
-        print(f"slipcar structured is {ratio:.1f} x as fast as CasADi + IPOPT in this run.")
+        for name in ours:
+            print(f"{name}: {ipopt / ours[name]:.2f} x as fast as CasADi + IPOPT in this run")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps({"cpu": cpu, "tables": tables}, indent=1))
     print(f"written: {arguments.out}")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner import moments
-from slipcar.planner.backends import make_solver
+from slipcar.planner.backends import Solver, make_solver
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem import Problem, checked_trajectory, model_of
 from slipcar.planner.scp import Iteration, Settings, iterate
@@ -175,7 +175,7 @@ def plan(
     problem: Problem,
     *,
     variance_weight: float = 1.0,
-    solver: str = "structured",
+    solver: str | Solver = "structured",
     tolerance: float = 1e-3,
     max_iterations: int = 100,
     trust_region: str = "adaptive",
@@ -191,7 +191,8 @@ def plan(
     Args:
         problem: anything that satisfies :class:`slipcar.planner.Problem`; a Scenario does.
         variance_weight: w ≥ 0; 0 is deterministic SCP.
-        solver: `"structured"`, `"osqp"` or `"cvxpy"`; see :mod:`slipcar.planner.backends`.
+        solver: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with their interface; see
+            :mod:`slipcar.planner.backends`.
         tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0.
         max_iterations: at most so many sub-problems, ≥ 1.
         trust_region: `"adaptive"`, `"paper"` (Δ₀ = 100, × 0.99) or `"none"`.
@@ -213,10 +214,12 @@ def plan(
     _check_number("variance_weight", variance_weight, zero_allowed=True)
     _check_number("tolerance", tolerance, zero_allowed=False)
     _check_number("terminal_tolerance", terminal_tolerance, zero_allowed=True)
-    if isinstance(max_iterations, bool) or int(max_iterations) != max_iterations:
+    if (
+        isinstance(max_iterations, bool)
+        or not isinstance(max_iterations, (int, np.integer))
+        or max_iterations < 1
+    ):
         raise ValueError(f"max_iterations must be an integer >= 1, not {max_iterations!r}")
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be >= 1, not {max_iterations}")
     if trust_region not in TRUST_REGIONS:
         raise ValueError(f"unknown trust_region {trust_region!r}; known: {list(TRUST_REGIONS)}")
     if linearization not in ("composite", "literal"):
@@ -238,7 +241,8 @@ def plan(
         terminal_tolerance=float(terminal_tolerance),
         callback=callback,
     )
-    found = iterate(model, make_solver(solver), TRUST_REGIONS[trust_region](), settings, x, u)
+    backend = make_solver(solver) if isinstance(solver, str) else solver
+    found = iterate(model, backend, TRUST_REGIONS[trust_region](), settings, x, u)
     at = found.at
     covariance = moments.covariance(at.A, at.sigma, model.dt)
     return Plan(
@@ -260,7 +264,7 @@ def plan(
         solve_time=time.perf_counter() - began,
         options={
             "variance_weight": float(variance_weight),
-            "solver": solver,
+            "solver": solver if isinstance(solver, str) else type(solver).__name__,
             "tolerance": float(tolerance),
             "max_iterations": int(max_iterations),
             "trust_region": trust_region,

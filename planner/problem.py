@@ -32,7 +32,8 @@ class Problem(Protocol):
       `penalty_jacobian(t, x)` -> (..., p, n).
     * `penalty(t, x)` -> c (..., p) with `penalty_weight` (p,): the cost Σ w max(0, c)².
     * `control_bounds`: None, (m,) for |u| ≤ bound, or (2, m) for lower and upper.
-    * `initial_guess()` -> states (N, n), controls (N−1, m); otherwise the uncontrolled path.
+    * `initial_guess()` -> states (N, n), controls (N−1, m); otherwise the uncontrolled path
+      (or the start at all times, if that path grows without bound).
     * `angles`: state components of period 2π, so that feedback wraps their errors.
     * `decode_observation(obs)` -> (t, x) and `encode_control(u)` -> action, for controllers
       that act in an environment.
@@ -119,7 +120,7 @@ class Model:
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     def guess(self) -> tuple[Array, Array]:
-        """The problem's initial guess, or the uncontrolled path where that stays finite."""
+        """The problem's own, else the uncontrolled path, else (it escapes) resting at the start."""
         N, n, m = len(self.times), self.state_dim, self.control_dim
         own = getattr(self.problem, "initial_guess", None)
         if own is not None:
@@ -128,8 +129,11 @@ class Model:
             u = np.clip(np.zeros((N - 1, m)), self.lower, self.upper)
             x = np.empty((N, n))
             x[0] = self.start
-            for k in range(N - 1):
-                x[k + 1] = x[k] + self.dt[k] * self.drift(self.times[k], x[k], u[k])
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                for k in range(N - 1):
+                    x[k + 1] = x[k] + self.dt[k] * self.drift(self.times[k], x[k], u[k])
+            if not np.isfinite(x).all():
+                x[:] = self.start
         return checked_trajectory(self, x, u)
 
 
@@ -155,6 +159,8 @@ def model_of(problem: Problem) -> Model:
     """
     required = ("start", "times", "control_weight", "drift", "diffusion", "terminal")
     missing = [name for name in required if not hasattr(problem, name)]
+    if hasattr(problem, "penalty") and not hasattr(problem, "penalty_weight"):
+        missing.append("penalty_weight (needed with penalty)")
     if missing:
         raise TypeError(
             f"{type(problem).__name__} is not a slipcar.planner.Problem: it lacks {missing}"

@@ -13,6 +13,8 @@ set is then polished here.
 from __future__ import annotations
 
 import dataclasses
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
@@ -51,11 +53,26 @@ class _ActiveSet:
 
 
 class StructuredSolver:
-    """Solver for sub-problems of one shape; remembers the last active set as a warm start."""
+    """Solver for sub-problems of one shape; remembers the last active set as a warm start.
 
-    def __init__(self) -> None:
+    Args:
+        compiled: run Newton's method compiled by numba (:mod:`.compiled`), the same steps to
+            rounding error; None does so where numba is installed.
+
+    Raises:
+        ImportError: if `compiled` is True and numba is missing.
+    """
+
+    def __init__(self, compiled: bool | None = None) -> None:
         self._kkt: BandedKkt | None = None
         self._active: _ActiveSet | None = None
+        self._compiled: ModuleType | None = None
+        if compiled is not False:
+            try:
+                self._compiled = import_module("slipcar.planner.backends.compiled")
+            except ImportError:
+                if compiled:
+                    raise
 
     def solve(self, sub: Subproblem) -> Solution:
         """Solve one sub-problem; see the module's docstring."""
@@ -63,18 +80,18 @@ class StructuredSolver:
         if self._kkt is None or self._kkt.shape != shape:
             self._kkt, self._active = BandedKkt(*shape), None
         kkt, pieces = self._kkt, _Pieces(sub)
-        kkt.load(sub)
         active = self._active
         if active is None or active.hinge.shape != sub.b.shape:
             active = pieces.none()
-        point, solves = _newton(kkt, pieces, active, _SOLVES)
+        point, solves = self._newton(pieces, active, _SOLVES)
         if point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho:
+            kkt.load(sub)
             inner, more = interior_point(sub, kkt)
             solves += more
             if inner is None:
                 self._active = None
                 return failed(sub, solves, f"not solved after {solves} LQ solves")
-            point, more = _newton(kkt, pieces, pieces.near(inner), _POLISHING_SOLVES)
+            point, more = self._newton(pieces, pieces.near(inner), _POLISHING_SOLVES)
             solves += more
             # The last interior systems are ill-conditioned: judge what the controls really do.
             candidates = [pieces.replayed(p) for p in (inner, point) if p is not None]
@@ -92,6 +109,31 @@ class StructuredSolver:
             objective=sub.objective(point.d, e),
             iterations=solves,
         )
+
+    def _newton(self, pieces: _Pieces, active: _ActiveSet, limit: int) -> tuple[Point | None, int]:
+        """:func:`_newton`, compiled or not."""
+        if self._compiled is None:
+            assert self._kkt is not None
+            self._kkt.load(pieces.sub)
+            return _newton(self._kkt, pieces, active, limit)
+        sub = pieces.sub
+        arrays = (sub.A, sub.B, sub.f, sub.Q, sub.q, sub.R, sub.r, sub.a, sub.b, sub.h, sub.G)
+        settled, solves, *parts = self._compiled.newton(
+            *(np.ascontiguousarray(array) for array in arrays),
+            sub.g,
+            sub.rho,
+            sub.tolerance,
+            sub.lower,
+            sub.upper,
+            pieces.stiffness,
+            pieces.softness,
+            active.hinge.copy(),
+            active.lower.copy(),
+            active.upper.copy(),
+            active.terminal.copy(),
+            limit,
+        )
+        return (Point(*parts) if settled else None), solves
 
 
 def _newton(
