@@ -13,65 +13,74 @@ from slipcar.planner import Plan, plan
 from slipcar.planner.backends import Solver
 from slipcar.planner.backends.structured import StructuredSolver
 
-
-def _time(call: Callable[[], Any], seconds: float) -> tuple[np.ndarray, Any]:
-    """Wall-clock seconds of repeated warm calls, and the last result."""
-    result = call()
-    times: list[float] = []
-    while sum(times) < seconds or len(times) < 5:
-        began = time.perf_counter()
-        result = call()
-        times.append(time.perf_counter() - began)
-    return np.array(times), result
+IPOPT = "CasADi + IPOPT, whole NLP"
 
 
-def rows(seconds: float = 2.0) -> list[dict[str, Any]]:
-    """One row a solver: median and quartiles in ms, cost reached, iterations."""
+#: Called so many times, all contenders in turn, so that a busy machine is shared fairly.
+ROUNDS = 40
+_SLOW, _SLOW_ROUNDS = 0.1, 5
+
+
+def _solvers() -> dict[str, Callable[[], Plan]]:
     scenario = Scenario.named("paper")
-    table: list[dict[str, Any]] = []
 
-    def add(name: str, times: np.ndarray, cost: float, iterations: int, status: str) -> None:
-        low, median, high = 1e3 * np.quantile(times, [0.25, 0.5, 0.75])
-        table.append(
-            {
-                "planner": name,
-                "ms (median)": median,
-                "quartiles": f"{low:.2f}–{high:.2f}",
-                "effort + obstacle": cost,
-                "iterations": iterations,
-                "status": status,
-                "runs": len(times),
-            }
-        )
+    def planner(make: Callable[[], str | Solver], weight: float) -> Callable[[], Plan]:
+        return lambda: plan(scenario, solver=make(), variance_weight=weight)
 
-    def structured(compiled: bool) -> Callable[[], Solver]:
-        return lambda: StructuredSolver(compiled)
+    return {
+        "slipcar structured (NumPy/SciPy), w = 0": planner(lambda: StructuredSolver(False), 0.0),
+        "slipcar structured (NumPy/SciPy), w = 1": planner(lambda: StructuredSolver(False), 1.0),
+        "slipcar structured (numba), w = 0": planner(lambda: StructuredSolver(True), 0.0),
+        "slipcar structured (numba), w = 1": planner(lambda: StructuredSolver(True), 1.0),
+        "slipcar osqp, w = 0": planner(lambda: "osqp", 0.0),
+        "slipcar cvxpy, w = 0": planner(lambda: "cvxpy", 0.0),
+    }
 
-    solvers: list[tuple[str, Callable[[], str | Solver], float]] = [
-        ("slipcar structured (NumPy/SciPy), w = 0", structured(False), 0.0),
-        ("slipcar structured (NumPy/SciPy), w = 1", structured(False), 1.0),
-        ("slipcar structured (numba), w = 0", structured(True), 0.0),
-        ("slipcar structured (numba), w = 1", structured(True), 1.0),
-        ("slipcar osqp, w = 0", lambda: "osqp", 0.0),
-        ("slipcar cvxpy, w = 0", lambda: "cvxpy", 0.0),
-    ]
-    for name, make, weight in solvers:
 
-        def call(make: Callable[[], str | Solver] = make, weight: float = weight) -> Plan:
-            return plan(scenario, solver=make(), variance_weight=weight)
+def _ipopt() -> Callable[[], Plan | tuple[bool, float, int]]:
+    from casadi_nlp import CasadiNlp
 
+    return CasadiNlp(Scenario.named("paper")).solve
+
+
+def rows(rounds: int = ROUNDS) -> list[dict[str, Any]]:
+    """One row a solver: median and quartiles in ms, cost reached, iterations."""
+    contenders: dict[str, Callable[[], Any]] = dict(_solvers())
+    try:
+        contenders[IPOPT] = _ipopt()
+    except ImportError as error:
+        print(f"skipped {IPOPT}: {error}")
+    results: dict[str, Any] = {}
+    times: dict[str, list[float]] = {}
+    for name, call in contenders.items():  # warm up: imports, compilation, workspaces
         try:
-            times, p = _time(call, seconds)
+            call()
+            results[name], times[name] = call(), []
         except ImportError as error:
             print(f"skipped {name}: {error}")
-            continue
-        add(name, times, p.cost, p.iterations, str(p.status))
-    try:
-        from casadi_nlp import CasadiNlp
-    except ImportError as error:
-        print(f"skipped CasADi + IPOPT: {error}")
-        return table
-    nlp = CasadiNlp(scenario)
-    times, (found, cost, iterations) = _time(nlp.solve, seconds)
-    add("CasADi + IPOPT, whole NLP", times, cost, iterations, "CONVERGED" if found else "failed")
-    return table
+    for turn in range(rounds):
+        for name in results:
+            if turn >= _SLOW_ROUNDS and np.median(times[name]) > _SLOW:
+                continue
+            began = time.perf_counter()
+            results[name] = contenders[name]()
+            times[name].append(time.perf_counter() - began)
+    return [_row(name, np.array(times[name]), results[name]) for name in results]
+
+
+def _row(name: str, times: np.ndarray, result: Plan | tuple[bool, float, int]) -> dict[str, Any]:
+    if isinstance(result, Plan):
+        status, cost, iterations = str(result.status), result.cost, result.iterations
+    else:
+        found, cost, iterations = result
+        status = "CONVERGED" if found else "failed"
+    low, median, high = 1e3 * np.quantile(times, [0.25, 0.5, 0.75])
+    return {
+        "planner": name,
+        "ms (median)": median,
+        "quartiles": f"{low:.2f}–{high:.2f}",
+        "effort + obstacle": cost,
+        "iterations": iterations,
+        "status": status,
+        "runs": len(times),
+    }

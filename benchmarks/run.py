@@ -18,12 +18,12 @@ import simulation
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=2.0, help="time spent on each row")
+    parser.add_argument("--rounds", type=int, default=planners.ROUNDS, help="plans per solver")
     parser.add_argument("--out", type=Path, default=Path("results/bench.json"), help="JSON file")
     arguments = parser.parse_args()
     tables = {
-        "planning, paper case, N = 41, warm": planners.rows(arguments.seconds),
-        "environment, features observation": simulation.environment_rows(arguments.seconds),
+        "planning, paper case, N = 41, warm": planners.rows(arguments.rounds),
+        "environment, features observation": simulation.environment_rows(),
         "evaluation": simulation.evaluation_rows(),
     }
     cpu = platform.processor() or platform.machine()
@@ -36,7 +36,7 @@ def main() -> None:
     for title, rows in tables.items():
         print(f"## {title}\n\n{pd.DataFrame(rows).to_markdown(index=False, floatfmt='.4g')}\n")
     ours = {row["planner"]: row["ms (median)"] for row in next(iter(tables.values()))}
-    ipopt = ours.get("CasADi + IPOPT, whole NLP")
+    ipopt = ours.get(planners.IPOPT)
     if ipopt is not None:
         for name in ours:
             print(f"{name}: {ipopt / ours[name]:.2f} x as fast as CasADi + IPOPT in this run")
