@@ -21,13 +21,13 @@ NAMED: dict[str, dict[str, Any]] = {
         "start": (0.0, 0.0, 0.0, 0.0, 0.0),
         "goal": (2.2, 3.0, 0.0, 0.0, 0.0),
     },
-    # Three posts on the line of travel: left, right, left.
+    # Three posts astride the line of travel, to be passed on the right, left and right.
     "slalom": {
         "start": (0.0, 0.0, 0.0, 0.0, 0.0),
-        "goal": (4.0, 0.0, 0.0, 0.0, 0.0),
-        "obstacles": ((1.0, -0.05, 0.2), (2.0, 0.05, 0.2), (3.0, -0.05, 0.2)),
-        "horizon": 6.0,
-        "nodes": 49,
+        "goal": (6.0, 0.0, 0.0, 0.0, 0.0),
+        "obstacles": ((1.5, 0.1, 0.25), (3.0, -0.1, 0.25), (4.5, 0.1, 0.25)),
+        "horizon": 12.0,
+        "nodes": 97,
     },
     # Two large obstacles leave a gap of 0.6 m beside the straight line.
     "gap": {
