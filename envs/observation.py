@@ -2,7 +2,7 @@
 
 `features` (default, 12 numbers scaled by hand to order one; SPEC §5):
 
-    0:2   (goal − position) / 2 m
+    0:2   (goal − position) / 1 m
     2:4   cos θ, sin θ
     4:6   v / 1 m/s, ω / 1 rad/s
     6     2 t/T − 1
@@ -28,14 +28,15 @@ KINDS = ("features", "state")
 #: Names in order, written beside a trained policy's weights and compared when it is loaded.
 LAYOUTS: dict[str, tuple[str, ...]] = {
     "features": (
-        "(goal_x - r_x)/2", "(goal_y - r_y)/2", "cos(theta)", "sin(theta)", "v", "omega",
+        "goal_x - r_x", "goal_y - r_y", "cos(theta)", "sin(theta)", "v", "omega",
         "2t/T-1", "(goal_x - r_x)/ttg", "(goal_y - r_y)/ttg", "(goal_theta - theta)/ttg",
         "v/ttg", "omega/ttg",
     ),
     "state": ("r_x", "r_y", "theta", "v", "omega", "t"),
 }  # fmt: skip
 
-_POSITION_SCALE = 2.0
+# In metres. Halved, PPO ends 0.05 to 0.09 higher in total cost (seeds 0, 1 and 3, 3 M steps).
+_POSITION_SCALE = 1.0
 _RATE_LIMIT = 5.0
 _WIDE = 1000.0
 

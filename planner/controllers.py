@@ -15,6 +15,7 @@ import numpy as np
 
 from slipcar.planner.feedback import default_tracking, lqr_gains, weight_matrix
 from slipcar.planner.plan import Plan
+from slipcar.planner.problem import control_limits
 
 Array = np.ndarray
 
@@ -128,7 +129,7 @@ class Feedback(OpenLoop):
                 plan.B,
                 np.diff(plan.times),
                 weight_matrix("Q", default_tracking(n) if Q is None else Q, n),
-                weight_matrix("R", own if R is None else R, m),
+                weight_matrix("R", own if R is None else R, m, definite=True),
                 weight_matrix("Qf", Qf, n),
             )
         gains = np.asarray(gains, dtype=np.float64)
@@ -137,6 +138,7 @@ class Feedback(OpenLoop):
             raise ValueError(f"gains must be finite and of shape {wanted}, not {gains.shape}")
         super().__init__(plan.replace(gains=gains))
         self._angles = tuple(getattr(plan.problem, "angles", ()))
+        self._bounds = control_limits(getattr(plan.problem, "control_bounds", None), m)
 
     def control(self, t: Any, x: Any) -> Array:
         """Control in physical units at times t (...,) [s] and states x (..., n): (..., m)."""
@@ -147,7 +149,7 @@ class Feedback(OpenLoop):
         assert self.plan.gains is not None
         # A sum over states rather than a matrix product: the same bits for any batch size.
         correction = (self.plan.gains[k] * error[..., None, :]).sum(axis=-1)
-        return self.plan.controls[k] + correction
+        return np.clip(self.plan.controls[k] + correction, *self._bounds)
 
     def _numbers(self) -> list[Array]:
         assert self.plan.gains is not None

@@ -65,7 +65,8 @@ class Linearization:
     def finite(self) -> bool:
         """Whether the model functions returned finite numbers everywhere."""
         return all(
-            np.isfinite(a).all() for a in (self.A, self.B, self.defect, self.sigma, self.c, self.g)
+            np.isfinite(a).all()
+            for a in (self.A, self.B, self.defect, self.sigma, self.c, self.C, self.g, self.G)
         )
 
 

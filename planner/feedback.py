@@ -40,23 +40,30 @@ def lqr_gains(A: Array, B: Array, dt: Array, Q: Array, R: Array, Qf: Array) -> A
     return K
 
 
-def weight_matrix(name: str, value: Any, n: int) -> Array:
-    """A scalar, a diagonal (n,) or a matrix (n, n) as a matrix.
+def weight_matrix(name: str, value: Any, n: int, *, definite: bool = False) -> Array:
+    """A scalar, a diagonal (n,) or a matrix (n, n) as a symmetric matrix.
 
     Raises:
         ValueError: for another shape, a non-finite entry or a matrix that is not positive
-            semidefinite.
+            semidefinite (with `definite`: not positive definite).
     """
-    given = np.asarray(value, dtype=np.float64)
+    try:
+        given = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, not {value!r}") from error
     if given.ndim == 0:
         given = given * np.eye(n)
     elif given.shape == (n,):
         given = np.diag(given)
     if given.shape != (n, n):
         raise ValueError(f"{name} must be a scalar, ({n},) or ({n}, {n}), not {given.shape}")
-    if not np.isfinite(given).all() or np.linalg.eigvalsh(0.5 * (given + given.T))[0] < -1e-12:
-        raise ValueError(f"{name} must be finite and positive semidefinite, not {value!r}")
-    return given
+    symmetric = 0.5 * (given + given.T)  # all that a quadratic form sees
+    if np.isfinite(given).all():
+        values = np.linalg.eigvalsh(symmetric)
+        if values[0] > 0.0 or (not definite and values[0] >= -1e-12 * max(1.0, values[-1])):
+            return symmetric
+    kind = "definite" if definite else "semidefinite"
+    raise ValueError(f"{name} must be finite and positive {kind}, not {value!r}")
 
 
 def default_tracking(n: int) -> Array:

@@ -138,12 +138,18 @@ class Plan:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
             header = json.loads(str(arrays.pop("header")))
+            version = header.get("format")
         except Exception as error:  # zipfile, NumPy and JSON each raise their own
             raise ValueError(f"{path} is not a plan or is damaged: {error}") from error
-        if header.get("format") != _FORMAT:
-            raise ValueError(
-                f"{path} has plan format {header.get('format')!r}; this version reads {_FORMAT}"
-            )
+        if version != _FORMAT:
+            raise ValueError(f"{path} has plan format {version!r}; this version reads {_FORMAT}")
+        try:
+            return cls._from_file(header, arrays)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path} is not a plan or is damaged: {error!r}") from error
+
+    @classmethod
+    def _from_file(cls, header: dict[str, Any], arrays: dict[str, Array]) -> Plan:
         history = _history_from(arrays)
         multipliers = Multipliers.from_dict(_strip(arrays, "multipliers."))
         return cls(
@@ -232,6 +238,8 @@ def plan(
     elif isinstance(guess, Plan):
         x, u = checked_trajectory(model, guess.mean, guess.controls)
     else:
+        if not isinstance(guess, (tuple, list)) or len(guess) != 2:
+            raise ValueError(f"guess must be a Plan or a pair (states, controls), not {guess!r}")
         x, u = checked_trajectory(model, *guess)
     settings = Settings(
         variance_weight=float(variance_weight),
@@ -279,8 +287,8 @@ def plan(
 def _check_number(name: str, value: Any, *, zero_allowed: bool) -> None:
     allowed = "finite and >= 0" if zero_allowed else "finite and > 0"
     try:
-        good = np.isfinite(value) and (value >= 0 if zero_allowed else value > 0)
-    except TypeError:
+        good = bool(np.isfinite(value) and (value >= 0 if zero_allowed else value > 0))
+    except (TypeError, ValueError):  # no number, or an array of several
         good = False
     if not good:
         raise ValueError(f"{name} must be {allowed}, not {value!r}")
@@ -305,8 +313,9 @@ def _problem_to_data(problem: Problem | None) -> dict[str, str] | None:
     to_json = getattr(problem, "to_json", None)
     if to_json is None:
         return None
+    cls = type(problem)
     for entry in entry_points(group="slipcar.problems"):
-        if entry.name == type(problem).__name__:
+        if entry.value == f"{cls.__module__}:{cls.__qualname__}":
             return {"class": entry.name, "json": to_json()}
     return None
 

@@ -159,7 +159,7 @@ def model_of(problem: Problem) -> Model:
     """
     required = ("start", "times", "control_weight", "drift", "diffusion", "terminal")
     missing = [name for name in required if not hasattr(problem, name)]
-    if hasattr(problem, "penalty") and not hasattr(problem, "penalty_weight"):
+    if getattr(problem, "penalty", None) is not None and not hasattr(problem, "penalty_weight"):
         missing.append("penalty_weight (needed with penalty)")
     if missing:
         raise TypeError(
@@ -172,7 +172,7 @@ def model_of(problem: Problem) -> Model:
     R = _finite("control_weight", problem.control_weight, (None, None))
     if R.shape[0] != R.shape[1] or not np.allclose(R, R.T) or np.linalg.eigvalsh(R)[0] <= 0:
         raise ValueError(f"control_weight must be symmetric positive definite, not {R!r}")
-    lower, upper = _bounds(getattr(problem, "control_bounds", None), len(R))
+    lower, upper = control_limits(getattr(problem, "control_bounds", None), len(R))
     n, m = len(start), len(R)
 
     t2, x2, u2 = times[:2], np.stack([start, start]), np.zeros((2, m))
@@ -244,10 +244,18 @@ def _finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
     return array
 
 
-def _bounds(given: Any, m: int) -> tuple[Array, Array]:
+def control_limits(given: Any, m: int) -> tuple[Array, Array]:
+    """Lower and upper bounds, each (m,), from what `Problem.control_bounds` may be.
+
+    Raises:
+        ValueError: for another shape, NaN, or lower ≥ upper.
+    """
     if given is None:
         return np.full(m, -np.inf), np.full(m, np.inf)
-    bounds = np.asarray(given, dtype=np.float64)
+    try:
+        bounds = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        bounds = np.full(0, np.nan)
     if bounds.shape == (m,):
         bounds = np.stack([-bounds, bounds])
     if bounds.shape != (2, m) or np.isnan(bounds).any() or not (bounds[0] < bounds[1]).all():

@@ -6,6 +6,9 @@
              accept or shorten                  trust_region
     until    ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt ≤ tolerance
 
+and the mean is, to first order, what the controls do: over long horizons and for cheap controls
+the step alone says little about the path.
+
 The merit function that steps are judged by is
 
     Φ = effort + penalty + w ∫ tr Σ dt + Σ λᵀf + ½ max|λ| ‖f‖₁ + ρ ‖g‖₁ (beyond its tolerance)
@@ -32,10 +35,15 @@ from slipcar.planner.trust_region import Step, TrustRegion
 
 Array = np.ndarray
 
-#: Weights of the terminal penalty: the first, and the largest before it is called infeasible.
-_MIN_RHO, _MAX_RHO = 1e3, 1e6
-#: A converged plan leaves no more than this of the terminal condition, per unit of the state.
+#: Weight of the terminal penalty at first, per unit of the multiplier it must exceed; how often
+#: it is raised tenfold; and the part of the virtual control that this must remove to go on.
+_FIRST_RHO, _RAISES, _WORTHWHILE = 1e3, 3, 0.01
+#: A converged plan leaves no more than this of the terminal condition, per unit of the state,
 _FEASIBILITY = 1e-6
+#: and no more than this between its mean and the path that its controls lead to.
+_CONSISTENCY = 1e-4
+#: Steps to where the model is not finite are rejected: no warning is needed on the way.
+_quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +60,7 @@ class Iteration:
         predicted: decrease of Φ by the convex model.
         actual: decrease of Φ.
         step: ∫ ‖u_{k+1} − u_k‖² dt.
-        trust_radius: ∫ E‖x − x_k‖² dt.
+        trust_radius: ∫ E‖x − x_k‖² dt; its mean's part alone while no trust region acts.
         trust_multiplier: −p¹ with p⁰ = −1.
         virtual_control: what the sub-problem's terminal condition lacks, 1-norm.
         defect: largest |x_k + dt b(x_k, u_k) − x_{k+1}|.
@@ -131,7 +139,6 @@ class _Iterate:
 
     lin: Linearization
     variance: moments.Variance | None
-    trust_weight: Array | None
 
     def variance_value(self) -> float:
         return 0.0 if self.variance is None else self.variance.value
@@ -153,7 +160,8 @@ def iterate(
         raise ValueError("drift, diffusion, penalty or terminal is not finite along the guess")
     K, n = at.lin.defect.shape
     adjoint, terminal, multiplier = np.zeros((K, n)), np.zeros(len(at.lin.g)), 0.0
-    rho = _MIN_RHO
+    first_rho = _FIRST_RHO * max(1.0, _terminal_force(model, at.lin))
+    rho, raises, lacked = first_rho, 0, np.inf
     last_step = np.inf
 
     def outcome(status: Status, message: str = "") -> Outcome:
@@ -207,16 +215,20 @@ def iterate(
         stop = settings.callback is not None and settings.callback(history[-1])
         if accepted:
             at, adjoint, terminal, multiplier = new, found.adjoint, found.terminal, used
+            size = 1.0 + float(np.max(np.abs(at.lin.x)))
+            lacking = sub.virtual_control(found.d)
+            feasible = lacking <= _FEASIBILITY * size
             # Where a trust region is needed to the end, a short step proves nothing by itself:
-            # the force it stands for, p¹ (x − x_k), must vanish too.
-            step += used**2 * radius
-            if step + last_step <= settings.tolerance:
-                lacking = sub.virtual_control(found.d) / (1.0 + float(np.max(np.abs(at.lin.x))))
-                if lacking <= _FEASIBILITY:
+            # the force it stands for, p¹ (x − x_k), must vanish too (beside that of the terminal
+            # penalty, where it is at its limit).
+            step += (used if feasible else used * first_rho / rho) ** 2 * radius
+            settled = step + last_step <= settings.tolerance
+            if settled and _inconsistency(settings, at.lin, lacking) <= _CONSISTENCY * size:
+                if feasible:
                     return outcome(Status.CONVERGED)
-                if rho >= _MAX_RHO:
+                if raises == _RAISES or lacking > (1.0 - _WORTHWHILE) * lacked:
                     return outcome(Status.INFEASIBLE)
-                rho, step = 10.0 * rho, np.inf
+                rho, raises, lacked, step = 10.0 * rho, raises + 1, lacking, np.inf
             last_step = step
         elif trust.collapsed:
             return outcome(Status.STALLED)
@@ -225,9 +237,43 @@ def iterate(
     return outcome(Status.MAX_ITERATIONS)
 
 
+@_quiet
+def _terminal_force(model: Model, at: Linearization) -> float:
+    """How large a multiplier moves the linearised end to where it shall be, at least.
+
+    With W = Σ Φ_k B_k (2 dt R)⁻¹ B_kᵀ Φ_kᵀ the controllability Gramian seen by G, a change γ of
+    the end at least cost takes W ν = γ, so ‖ν‖ ≥ ‖γ‖ / λ_max(W). This sets the scale of the
+    terminal penalty, whatever the units of states and costs.
+    """
+    Phi = np.empty((len(at.A), *at.G.shape))  # G Φ_k: what arrives at node k + 1 does at the end
+    Phi[-1] = at.G
+    for k in range(len(at.A) - 1, 0, -1):
+        Phi[k - 1] = Phi[k].dot(at.A[k])
+    missing = at.g + np.einsum("kqi,ki->q", Phi, at.defect)
+    pushed = Phi @ at.B
+    W = np.einsum("kqi,ij,krj,k->qr", pushed, np.linalg.inv(2.0 * model.R), pushed, 1.0 / model.dt)
+    strength = float(np.max(np.linalg.eigvalsh(W), initial=0.0)) if np.isfinite(W).all() else 0.0
+    return float(np.linalg.norm(missing)) / strength if strength > 0.0 else 0.0
+
+
+def _inconsistency(settings: Settings, at: Linearization, lacking: float) -> float:
+    """How far, to first order, the mean is from the path that the controls lead to.
+
+    The defects carried forward along the linearised dynamics; and the terminal residual beyond
+    what the sub-problem said is lacking.
+    """
+    gap, worst = np.zeros(at.x.shape[1]), 0.0
+    for A, defect in zip(at.A, at.defect, strict=True):
+        gap = A @ gap + defect
+        worst = max(worst, float(np.max(np.abs(gap))))
+    beyond = np.maximum(np.abs(at.g) - settings.terminal_tolerance, 0.0)
+    return max(worst, abs(float(beyond.sum()) - lacking))
+
+
+@_quiet
 def _iterate_at(model: Model, settings: Settings, x: Array, u: Array) -> _Iterate:
     lin = linearize(model, x, u)
-    return _Iterate(lin, _variance(model, lin, settings.variance_weight), None)
+    return _Iterate(lin, _variance(model, lin, settings.variance_weight))
 
 
 def _variance(model: Model, lin: Linearization, weight: float) -> moments.Variance | None:
@@ -253,7 +299,7 @@ def _solve(
     """Solve the sub-problem within the trust region: with the multiplier it asks for."""
     weight: Array | None = None
     for _ in range(60):
-        if weight is None and trust.multiplier > 0.0:
+        if weight is None and (trust.multiplier > 0.0 or trust.limits_radius):
             weight = _trust_weight(model, settings, at)
         sub = convexify(
             model,
@@ -286,6 +332,7 @@ def _trust_weight(model: Model, settings: Settings, at: _Iterate) -> Array:
     return moments.trust_region_weight(variance.hessian / weight, model.dt)
 
 
+@_quiet
 def _merit(settings: Settings, at: _Iterate, found: Solution, rho: float) -> float:
     """Φ with the multipliers of the sub-problem at hand; see the module's docstring."""
     lin = at.lin
@@ -300,6 +347,7 @@ def _merit(settings: Settings, at: _Iterate, found: Solution, rho: float) -> flo
     )
 
 
+@_quiet
 def _model_merit(
     model: Model, settings: Settings, at: _Iterate, sub: Subproblem, found: Solution
 ) -> float:

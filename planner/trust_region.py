@@ -12,6 +12,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 
+#: Relative accuracy of the merit function and of its decrease by the model.
+_MERIT_NOISE = 1e-8
+
+
 @dataclasses.dataclass(frozen=True)
 class Step:
     """What a schedule judges a step by.
@@ -32,7 +36,14 @@ class Step:
 
 
 class TrustRegion(Protocol):
-    """A schedule of trust regions."""
+    """A schedule of trust regions.
+
+    Attributes:
+        limits_radius: whether `fits` looks at the radius, which must then be measured in full
+            even while the multiplier is zero.
+    """
+
+    limits_radius: bool
 
     @property
     def multiplier(self) -> float:
@@ -56,6 +67,7 @@ class TrustRegion(Protocol):
 class NoTrustRegion:
     """Every step is taken whole."""
 
+    limits_radius = False
     multiplier = 0.0
 
     @property
@@ -82,6 +94,8 @@ class PaperTrustRegion:
     The multiplier that makes the step fit is found by bracketing and bisection on its
     logarithm; the radius decreases with the multiplier.
     """
+
+    limits_radius = True
 
     def __init__(self, radius: float = 100.0, shrink: float = 0.99) -> None:
         self.radius, self.shrink = radius, shrink
@@ -126,6 +140,8 @@ class AdaptiveTrustRegion:
     rises when one is rejected or barely pays and falls after good ones.
     """
 
+    limits_radius = False
+
     def __init__(self, free: int = 25, patience: int = 30) -> None:
         self.multiplier = 0.0
         self._free, self._patience = free, patience
@@ -143,7 +159,9 @@ class AdaptiveTrustRegion:
             return True
         # The multiplier that makes the penalty as large as what the step promised.
         natural = step.predicted / max(step.radius, 1e-300)
-        ratio = step.actual / max(step.predicted, 1e-300)
+        # Both decreases carry rounding errors of the merit function, all that is left at the end.
+        noise = _MERIT_NOISE * (1.0 + abs(step.before))
+        ratio = (step.actual + noise) / (step.predicted + noise)
         if not finite or ratio < 1e-3:
             self._rejected += 1
             self.multiplier = max(4.0 * self.multiplier, 0.5 * natural) or 1.0

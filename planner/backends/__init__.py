@@ -97,8 +97,14 @@ def make_solver(name: str) -> Solver:
 
     Raises:
         ValueError: for an unknown name, listing the known ones.
-        ImportError: if the package behind it is not installed.
+        ImportError: if the package behind it is not installed, with what to type.
     """
     if name not in BACKENDS:
         raise ValueError(f"unknown solver {name!r}; the solvers are {list(BACKENDS)}")
-    return BACKENDS[name]()
+    try:
+        return BACKENDS[name]()
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f'solver={name!r} needs the package {error.name}: pip install "slipcar[qp]"; '
+            f"solver='structured' needs none"
+        ) from error

@@ -19,6 +19,8 @@ import numpy as np
 
 Array = np.ndarray
 
+_STEP_PRECISION = 1e-3  # as in structured.py
+
 
 @numba.njit(cache=True, fastmath=False)
 def _lq(A, B, f, Q, q, R, r, G, held, softness, right, d, e, adjoint, nu):
@@ -260,7 +262,7 @@ def _line_search(Q, q, R, r, h, lower, upper, stiffness, c, d, e, c_to, d_to, e_
         new = t - value / change if change > 0.0 else -1.0
         if not low < new < high:
             new = 0.5 * (low + high)
-        if abs(new - t) <= 1e-14 * max(new, 1e-300):
+        if abs(new - t) <= _STEP_PRECISION * new:
             return new
         t = new
     return high

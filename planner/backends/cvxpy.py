@@ -23,11 +23,19 @@ class CvxpySolver:
     Args:
         solver: any conic solver cvxpy has installed; None takes the first of Clarabel, ECOS,
             SCS that is.
+
+    Raises:
+        ImportError: if none of them is.
     """
 
     def __init__(self, solver: str | None = None) -> None:
         installed = cp.installed_solvers()
-        self.solver = solver or next(name for name in _SOLVERS if name in installed)
+        found = solver or next((name for name in _SOLVERS if name in installed), None)
+        if found is None:
+            raise ImportError(
+                f'cvxpy has none of {list(_SOLVERS)} installed: pip install "slipcar[qp]"'
+            )
+        self.solver = found
 
     def solve(self, sub: Subproblem) -> Solution:
         """Solve one sub-problem."""

@@ -115,7 +115,8 @@ def interior_point(sub: Subproblem, kkt: BandedKkt) -> tuple[Point | None, int]:
         pairs = pairs.moved(change, step)
         w = w + step * dw
         missing = np.abs(sub.G @ point.d[-1] + sub.g - w - pairs.plus + pairs.minus) / size
-        if pairs.gap() < _GAP * scale and np.max(missing, initial=0.0) < _GAP:
+        size_of_cost = max(scale, abs(sub.objective(point.d, point.e)))
+        if pairs.gap() < _GAP * size_of_cost and np.max(missing, initial=0.0) < _GAP:
             return point, steps
     return None, _MAX_STEPS
 

@@ -81,7 +81,7 @@ class OsqpSolver:
             self._workspace.setup(patterns[0], q, patterns[1], low, high, **self._settings)
         else:
             self._workspace.update(Px=P, q=q, Ax=A, l=low, u=high)
-        return self._workspace.solve()
+        return self._workspace.solve(raise_error=False)
 
 
 def _usable(result: Any, sub: Subproblem, pattern: _Pattern) -> bool:

@@ -26,14 +26,14 @@ from slipcar.planner.convexify import Subproblem
 Array = np.ndarray
 
 #: Solves before the interior point takes over, and those it leaves for polishing.
-_SOLVES, _POLISHING_SOLVES = 20, 4
+_SOLVES, _POLISHING_SOLVES = 20, 8
 #: Active bounds are held by a weight so much stiffer than the cost of control: the control
 #: passes its bound by 1e-12 of what its multiplier would make of it, and is clipped in the end.
 _BOUND_WIDTH = 1e-12
 #: The terminal condition gives way by this much as its multiplier reaches ρ.
-_TERMINAL_WIDTH = 1e-9
-#: What is less than this off its bound or box is on it, for an interior point's solution.
-_NEAR = 1e-6
+_TERMINAL_WIDTH = 1e-10
+#: Relative precision of a line search: the last step is always a full one.
+_STEP_PRECISION = 1e-3
 
 
 @dataclasses.dataclass
@@ -220,17 +220,27 @@ class _Pieces:
         return self._with_terminal(point, terminal)
 
     def near(self, point: Point) -> _ActiveSet:
-        """Pieces the solution of the interior point lies on, or almost."""
+        """Pieces the solution of the interior point lies on, or almost.
+
+        Of a slack and its multiplier, the one that is smaller for its kind is the one that
+        vanishes.
+        """
         sub, nu = self.sub, point.terminal
-        residual = np.abs(sub.G @ point.d[-1] + sub.g)
+        residual = sub.G @ point.d[-1] + sub.g
+        beyond = (np.abs(residual) - sub.tolerance) / (1.0 + np.abs(sub.g))
+        share = np.abs(nu) / sub.rho
         sign = np.where(nu < 0.0, -1, 1)
-        terminal = np.where(residual < sub.tolerance * (1.0 - _NEAR) - 1e-12, 0, sign)
-        terminal = np.where(residual > sub.tolerance + _NEAR, 2 * sign, terminal)
+        terminal = np.where(beyond > 1.0 - share, 2 * sign, sign)
+        if sub.tolerance > 0.0:
+            terminal = np.where(-beyond > share, 0, terminal)
         found = self._with_terminal(point, terminal)
         if self.bounded:
-            margin = _NEAR * (1.0 + np.abs(point.e))
-            found.lower = point.e < sub.lower + margin
-            found.upper = point.e > sub.upper - margin
+            slope = np.matmul(sub.R, point.e[..., None])[..., 0] + sub.r
+            slope += np.matmul(point.adjoint[:, None], sub.B)[:, 0]
+            slope /= max(1.0, float(np.max(np.abs(slope))))
+            size = 1.0 + np.abs(point.e)
+            found.lower = (point.e - sub.lower) / size < slope
+            found.upper = (sub.upper - point.e) / size < -slope
         return found
 
     def _with_terminal(self, point: Point, terminal: Array) -> _ActiveSet:
@@ -294,8 +304,7 @@ class _Pieces:
 
         if slope(1.0)[0] <= 0.0:
             return 1.0
-        # Newton on a piecewise linear increasing function, kept inside a shrinking bracket:
-        # it ends on the very piece that holds the zero.
+        # Newton on a piecewise linear increasing function, kept inside a shrinking bracket.
         low, high, t = 0.0, 1.0, 0.0
         for _ in range(60):
             value, change = slope(t)
@@ -305,7 +314,7 @@ class _Pieces:
                 low = t
             guess = t - value / change if change > 0.0 else -1.0
             new = guess if low < guess < high else 0.5 * (low + high)
-            if abs(new - t) <= 1e-14 * max(new, 1e-300):
+            if abs(new - t) <= _STEP_PRECISION * new:
                 return new
             t = new
         return high

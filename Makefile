@@ -1,0 +1,103 @@
+# Two commands on a bare machine with Python >= 3.11 and make:
+#   make compare    the main job: a table and figures in results/
+#   make test       the tests
+# Both set up .venv first, under the pins of constraints.txt, and only when something changed.
+
+PYTHON ?= python3
+# Passed on to the command: make compare ARGS="--episodes 1000", make test ARGS="-k scenario"
+ARGS ?=
+# Options of pip for torch alone, say --index-url with the address of a CPU-only build.
+TORCH_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+# Errors alone: the warnings are about setuptools' opinion of its own features.
+PIP := $(BIN)/python -m pip -qq install
+PACKAGES := envs planner baselines evaluation
+# torch comes first and exactly: whatever asked for it otherwise would take the newest build,
+# with gigabytes of CUDA packages.
+TORCH := torch==2.13.0
+
+# The editable install is a tree of links to the package's files under build/, so it is renewed
+# when a file came or went, as well as when requirements or pins changed. A name in build/ and a
+# prerequisite in .venv/: deleting either folder is enough to start afresh.
+STATE := $(shell { cat pyproject.toml constraints.txt; \
+	find $(PACKAGES) -name __pycache__ -prune -o -type f -print | LC_ALL=C sort; } 2>/dev/null \
+	| cksum | cut -d' ' -f1)
+PLACE := $(shell pwd | cksum | cut -d' ' -f1)
+CREATED := $(VENV)/created-$(PLACE)
+INSTALLED := build/installed-$(STATE)
+BENCH_INSTALLED := build/installed-bench-$(STATE)
+
+.PHONY: help install compare test test-long train bench lint types lock clean
+.DEFAULT_GOAL := help
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/:.*## /:/' \
+		| while IFS=: read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
+	@echo '  options: ARGS="..." for the command, PYTHON=python3.12 for a new $(VENV)'
+
+install: $(INSTALLED)  ## set up .venv (every other target does it when needed)
+
+compare: $(INSTALLED)  ## the main job: SCP, feedback and PPO over the same noise; results/compare
+	$(BIN)/slipcar compare $(ARGS)
+
+test: $(INSTALLED)  ## all tests but the long ones
+	$(BIN)/python -m pytest $(ARGS)
+
+test-long: $(INSTALLED)  ## the tests that take minutes
+	$(BIN)/python -m pytest -m long $(ARGS)
+
+train: $(INSTALLED)  ## train the PPO baseline; runs/ppo
+	$(BIN)/slipcar train $(ARGS)
+
+bench: $(BENCH_INSTALLED)  ## measure planner, environment and evaluation; results/bench.json
+	$(BIN)/python benchmarks/run.py $(ARGS)
+
+lint: types  ## ruff (rules and format) and mypy
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(INSTALLED)  ## mypy over the installed package
+	$(BIN)/mypy
+
+# The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
+compare train bench: export OMP_NUM_THREADS ?= 1
+
+$(CREATED):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo 'slipcar needs Python >= 3.11: make PYTHON=/path/to/python3' >&2; exit 1; }
+	@echo 'Setting up $(VENV) once, a few minutes: torch (the largest download) ...'
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(PIP) 'pip>=25.1'
+	@$(PIP) $(TORCH_ARGS) -c constraints.txt $(TORCH)
+	@touch $@
+
+$(INSTALLED): $(CREATED)
+	@echo 'Installing slipcar with its extras and tools ...'
+	@rm -rf build/installed-* build/__editable__.*
+	@$(PIP) -c constraints.txt 'setuptools>=77'
+	@$(PIP) -c constraints.txt --no-build-isolation --group dev --editable '.[all]'
+	@touch $@
+
+$(BENCH_INSTALLED): $(INSTALLED)
+	@echo 'Installing what the benchmarks compare with ...'
+	@$(PIP) -c constraints.txt 'slipcar[bench]'
+	@touch $@
+
+# The newest versions that pyproject.toml admits, tried out in a venv of their own, become the
+# pins. The local part of torch's version is dropped, so that any build of it will do.
+lock:  ## renew constraints.txt with the newest versions that pyproject.toml admits
+	rm -rf build/lock
+	$(PYTHON) -m venv build/lock
+	build/lock/bin/python -m pip -qq install 'pip>=25.1'
+	build/lock/bin/python -m pip -qq install $(TORCH_ARGS) $(TORCH)
+	build/lock/bin/python -m pip -qq install --group dev '.[all,bench]'
+	build/lock/bin/python -m pip freeze --all --exclude pip --exclude slipcar > build/lock/pins
+	{ echo '# Made by `make lock`: do not edit.'; \
+		sed -E 's/^(torch==[^+]*)\+.*/\1/' build/lock/pins; } > constraints.txt
+	rm -rf build/lock
+
+clean:  ## remove everything that make made, results and runs excepted
+	rm -rf $(VENV) build dist slipcar.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

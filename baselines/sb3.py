@@ -1,0 +1,170 @@
+"""Stable-Baselines3's `VecEnv` over the native vector environment.
+
+The two conventions differ in three ways, and this adapter is the translation:
+
+* SB3 resets finished episodes inside `step` and hands the last observation over in
+  `info["terminal_observation"]`: our SAME_STEP autoreset, `final_obs`.
+* SB3 asks for `info["TimeLimit.truncated"]`; it is always False here, because the horizon
+  belongs to the problem (SPEC §5: bootstrapping there makes learning fail).
+* SB3 wants one dictionary per sub-environment. Only those of finished episodes are filled,
+  with the `"episode"` entry its Monitor would write, so no Python loop runs over
+  sub-environments in mid-episode.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from slipcar.envs import SlipCarVectorEnv
+
+
+class SB3VecEnv(VecEnv):
+    """`SlipCarVectorEnv` as Stable-Baselines3 wants it.
+
+    Rewards are float32 and multiplied by `reward_scale`; `info["episode"]["r"]` at an
+    episode's end is the unscaled return. At an episode's end `info` also holds the whole
+    episode's `effort` and `obstacle`, its `goal` cost, `collision` and `clearance`.
+
+    Args:
+        env: the native environment, with SAME_STEP autoreset.
+        reward_scale: factor on the rewards, finite and > 0.
+
+    Raises:
+        ValueError: for another autoreset mode or a bad scale.
+    """
+
+    def __init__(self, env: SlipCarVectorEnv, reward_scale: float = 1.0) -> None:
+        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"autoreset_mode must be {AutoresetMode.SAME_STEP.value!r} for "
+                f"Stable-Baselines3, not {env.autoreset_mode.value!r}"
+            )
+        if not (np.isfinite(reward_scale) and reward_scale > 0.0):
+            raise ValueError(f"reward_scale must be finite and > 0, not {reward_scale!r}")
+        self.env = env
+        self.reward_scale = float(reward_scale)
+        self._actions = np.zeros((env.num_envs, 2), dtype=np.float32)
+        self._totals = np.zeros((3, env.num_envs))  # return, effort, obstacle of the episode
+        self._lengths = np.zeros(env.num_envs, dtype=np.int64)
+        self._began = time.perf_counter()
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Start new episodes everywhere, with the seeds given to :meth:`seed` if any.
+
+        Returns:
+            Observations, (num_envs, d) float32.
+
+        Raises:
+            ValueError: for options: the environment has none.
+        """
+        if any(self._options):
+            raise ValueError(f"unknown reset options {self._options[0]}; none are known")
+        seeds = list(self._seeds) if any(s is not None for s in self._seeds) else None
+        observation, _ = self.env.reset(seed=seeds)
+        self._reset_seeds()
+        self._totals[:] = 0.0
+        self._lengths[:] = 0
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions, (num_envs, 2), for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """One control interval everywhere.
+
+        Returns:
+            Observations (num_envs, d); scaled rewards (num_envs,) float32; whether episodes
+            ended (num_envs,); one dictionary each, empty but for ended episodes.
+
+        Raises:
+            ValueError: for misshapen or non-finite actions.
+        """
+        observation, reward, done, _, info = self.env.step(self._actions)
+        # Where an episode ended, `info` tells of the new one and `final_info` of the old.
+        last = info.get("final_info")
+        for row, name in zip(self._totals[1:], ("effort", "obstacle"), strict=True):
+            row += info[name] if last is None else np.where(done, last[name], info[name])
+        self._totals[0] += reward
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if last is not None:
+            for i in np.flatnonzero(done):
+                infos[i] = self._end_of_episode(int(i), info["final_obs"][i], last)
+            self._totals[:, done] = 0.0
+            self._lengths[done] = 0
+        return observation, (reward * self.reward_scale).astype(np.float32), done, infos
+
+    def _end_of_episode(
+        self, i: int, observation: np.ndarray, last: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
+        total, effort, obstacle = self._totals[:, i].tolist()
+        seconds = round(time.perf_counter() - self._began, 6)
+        return {
+            "terminal_observation": observation,
+            "TimeLimit.truncated": False,
+            "episode": {"r": total, "l": int(self._lengths[i]), "t": seconds},
+            "effort": effort,
+            "obstacle": obstacle,
+            "goal": float(last["goal"][i]),
+            "collision": bool(last["collision"][i]),
+            "clearance": float(last["clearance"][i]),
+        }
+
+    def close(self) -> None:
+        """Close the native environment."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """The native environment's attribute, once per index: sub-environments share it.
+
+        Raises:
+            AttributeError: if there is none of that name.
+        """
+        value = getattr(self.env, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(
+        self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None
+    ) -> None:
+        """Refused: sub-environments share everything but their random generators.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"cannot set {attr_name!r}: sub-environments share attributes")
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: int | Iterable[int] | None = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Refused: sub-environments are rows of arrays and have no methods of their own.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"cannot call {method_name!r} on one sub-environment")
+
+    def env_is_wrapped(
+        self,
+        wrapper_class: Callable[..., gym.Wrapper[Any, Any, Any, Any]],
+        indices: int | Iterable[int] | None = None,
+    ) -> list[bool]:
+        """False for each index: there are no wrappers."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """None each: the vector environment does not render."""
+        return [None] * self.num_envs

@@ -1,0 +1,328 @@
+"""The package as a thing: what it contains, what imports what, and what importing it costs."""
+
+import ast
+import importlib
+import importlib.metadata
+import re
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+NAMES = {"envs", "planner", "baselines", "evaluation"}
+MAY_IMPORT = {
+    "envs": {"envs"},
+    "planner": {"planner"},
+    "baselines": {"baselines", "envs", "planner"},
+    "evaluation": NAMES,
+}
+# What no plan needs, or not until it is asked for.
+HEAVY = ["torch", "gymnasium", "matplotlib", "pandas", "osqp", "cvxpy", "numba"]
+
+
+def sources(name="*"):
+    """Python files of the package `name`, of all four by default."""
+    packages = NAMES if name == "*" else {name}
+    return sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
+
+
+def folders():
+    """Every folder with an `__init__.py`, as the module that it should be."""
+    inits = [path for path in sources() if path.name == "__init__.py"]
+    return {"slipcar." + ".".join(path.parent.relative_to(ROOT).parts) for path in inits}
+
+
+def imported(source, package=""):
+    """Dotted names that `import` statements ask for, anywhere in the source.
+
+    Relative ones are resolved against `package`, the module's own package.
+    """
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1]
+            base = ".".join([*(above if node.level else []), *filter(None, [node.module])])
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
+
+
+def forbidden(name, source):
+    """Imports in a module of `slipcar.<name>` that break the order of the packages."""
+    broken = set()
+    for target in imported(source, f"slipcar.{name}"):
+        top, _, rest = target.partition(".")
+        bare = top in NAMES
+        wrong_way = top == "slipcar" and rest.split(".")[0] not in MAY_IMPORT[name]
+        if bare or wrong_way:
+            broken.add(target)
+    return broken
+
+
+def run(code, python=sys.executable):
+    """The output of a fresh interpreter."""
+    done = subprocess.run([python, "-c", code], capture_output=True, text=True, cwd="/")
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# --- what importing costs ------------------------------------------------------------------
+
+
+def test_importing_the_planner_imports_nothing_heavy():
+    loaded = run("import sys, slipcar.planner; print(*sys.modules)").split()
+    assert "slipcar.planner.scp" in loaded
+    assert not {name.split(".")[0] for name in loaded} & set(HEAVY)
+
+
+def test_importing_the_planner_takes_less_than_half_a_second():
+    """The one timing among the tests: an interpreter that starts, imports and ends."""
+
+    def seconds():
+        begin = time.perf_counter()
+        run("import slipcar.planner")
+        return time.perf_counter() - begin
+
+    assert min(seconds() for _ in range(3)) < 0.5
+
+
+WITHOUT_EXTRAS = """
+import sys
+for name in {missing}:
+    sys.modules[name] = None    # importing it raises ImportError
+
+import gymnasium as gym
+from slipcar.envs import Scenario
+from slipcar.planner import Feedback, OpenLoop, Status, plan
+
+scenario = Scenario.named("paper")
+p = plan(scenario)
+assert p.status is Status.CONVERGED, p.status
+env = gym.make("slipcar.envs:SlipCar-v0", scenario="paper")
+for controller in OpenLoop(p), Feedback(p){policy}:
+    observation, _ = env.reset(seed=0)
+    done, steps = False, 0
+    while not done:
+        action, _ = controller.predict(observation)
+        observation, _, done, _, info = env.step(action)
+        steps += 1
+    assert steps == scenario.nodes - 1
+print("drove")
+"""
+EXTRAS = sorted(
+    {
+        *["torch", "stable_baselines3", "tensorboard", "tqdm", "matplotlib", "PIL", "pygame"],
+        *["osqp", "cvxpy", "clarabel", "numba", "casadi"],
+    }
+)
+
+
+def test_planning_and_driving_need_no_extra():
+    assert run(WITHOUT_EXTRAS.format(missing=EXTRAS, policy="")) == "drove\n"
+
+
+def test_the_shipped_policy_needs_no_extra():
+    policy = ', __import__("slipcar.baselines").baselines.load_policy()'
+    assert run(WITHOUT_EXTRAS.format(missing=EXTRAS, policy=policy)) == "drove\n"
+
+
+# --- what imports what ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_imports_go_one_way(name):
+    assert sources(name)
+    broken = {
+        str(path.relative_to(ROOT)): found
+        for path in sources(name)
+        if (found := forbidden(name, path.read_text(encoding="utf-8")))
+    }
+    assert not broken
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "broken"),
+    [
+        ("planner", "from slipcar.envs import Scenario", {"slipcar.envs.Scenario"}),
+        ("planner", "from slipcar.planner import plan", set()),
+        ("planner", "def f():\n    import slipcar.envs.car as car", {"slipcar.envs.car"}),
+        ("planner", "from slipcar import envs", {"slipcar.envs"}),
+        ("planner", "from ..envs import car", {"slipcar.envs.car"}),
+        ("planner", "from .scp import solve\nfrom . import plan", set()),
+        ("envs", "import slipcar.planner", {"slipcar.planner"}),
+        ("baselines", "from slipcar.envs import car\nimport slipcar.planner", set()),
+        ("baselines", "from slipcar.evaluation import rollout", {"slipcar.evaluation.rollout"}),
+        ("evaluation", "import slipcar.baselines, slipcar.envs, numpy", set()),
+        ("evaluation", "import envs.car", {"envs.car"}),
+        ("evaluation", "from planner import plan", {"planner.plan"}),
+    ],
+)
+def test_the_guard_of_imports_sees(name, source, broken):
+    assert forbidden(name, source) == broken
+
+
+def test_whatever_is_imported_is_declared():
+    project = PYPROJECT["project"]
+    extras = [line for lines in project["optional-dependencies"].values() for line in lines]
+    declared = {_distribution(line) for line in project["dependencies"] + extras}
+    providers = importlib.metadata.packages_distributions()
+    for path in sources():
+        for target in imported(path.read_text(encoding="utf-8"), "slipcar.x"):
+            top = target.split(".")[0]
+            if top in sys.stdlib_module_names or top == "slipcar":
+                continue
+            candidates = {_distribution(provider) for provider in providers.get(top, [top])}
+            assert candidates & declared, f"{path.relative_to(ROOT)} imports {top}, undeclared"
+
+
+def _distribution(requirement):
+    """The normalised name in `Some_name>=1.0`."""
+    return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
+
+
+# --- what it says it is --------------------------------------------------------------------
+
+
+def test_every_folder_is_listed():
+    setup = PYPROJECT["tool"]["setuptools"]
+    assert set(setup["packages"]) == folders()
+    assert setup["package-dir"] == {
+        name: name.removeprefix("slipcar.").replace(".", "/") for name in folders()
+    }
+    assert set(PYPROJECT["tool"]["mypy"]["packages"]) == {f"slipcar.{name}" for name in NAMES}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_is_typed(name):
+    assert (Path(importlib.import_module(f"slipcar.{name}").__path__[0]) / "py.typed").is_file()
+
+
+def test_one_version_everywhere():
+    version = PYPROJECT["project"]["version"]
+    assert importlib.metadata.version("slipcar") == version
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## \[(\d[^]]*)\]", changelog, re.MULTILINE)[0] == version
+
+
+def test_every_pin_satisfies_what_is_asked_for():
+    from packaging.requirements import Requirement
+
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    pins = {_distribution(name): version for name, version in pins.items()}
+    assert pins["torch"] == "2.13.0"  # any build of it: no local version
+    assert "slipcar" not in pins
+    project, groups = PYPROJECT["project"], PYPROJECT["dependency-groups"]
+    asked = [*project["dependencies"], *groups["dev"]]
+    asked += [line for lines in project["optional-dependencies"].values() for line in lines]
+    for requirement in map(Requirement, asked):
+        if requirement.name != "slipcar":
+            assert pins[_distribution(requirement.name)] in requirement.specifier, requirement
+
+
+def test_a_saved_plan_finds_its_problem():
+    (entry,) = importlib.metadata.entry_points(group="slipcar.problems", name="Scenario")
+    scenario = entry.load().named("paper")
+    assert entry.load().from_json(scenario.to_json()) == scenario
+
+
+def test_the_command_answers():
+    script = Path(sys.executable).with_name("slipcar")
+    done = subprocess.run([script, "--help"], capture_output=True, text=True, cwd="/")
+    assert done.returncode == 0, done.stderr
+    assert all(command in done.stdout for command in ("compare", "plan", "simulate", "train"))
+
+
+# --- what is shipped -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel built from a copy, so that nothing left in the checkout's build/ gets into it."""
+    checkout = tmp_path_factory.mktemp("checkout")
+    ignore = shutil.ignore_patterns("__pycache__")
+    for name in NAMES:
+        shutil.copytree(ROOT / name, checkout / name, ignore=ignore)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, checkout)
+    shutil.copytree(ROOT / "tests" / "data", checkout / "tests")  # something not to be shipped
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "."]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=checkout)
+    assert done.returncode == 0, done.stderr
+    (path,) = checkout.glob("slipcar-*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def shipped(wheel):
+    """Name -> bytes of each file in the wheel."""
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(shipped):
+    kept = {".py", ".typed"}
+    expected = {
+        f"slipcar/{path.relative_to(ROOT)}"
+        for name in NAMES
+        for path in (ROOT / name).rglob("*")
+        if path.suffix in kept or (path.parent.name == "weights" and path.is_file())
+    }
+    assert {name for name in shipped if ".dist-info/" not in name} == expected
+
+
+def test_the_wheel_carries_the_shipped_policy(shipped):
+    weights = {Path(name).name for name in shipped if "/weights/" in name}
+    assert {"paper.json", "paper.safetensors"} <= weights
+
+
+def test_the_wheel_knows_its_licence_and_entry_points(shipped):
+    info = f"slipcar-{PYPROJECT['project']['version']}.dist-info"
+    assert shipped[f"{info}/licenses/LICENSE"] == (ROOT / "LICENSE").read_bytes()
+    entries = shipped[f"{info}/entry_points.txt"].decode()
+    assert "[console_scripts]\nslipcar = slipcar.evaluation.cli:main" in entries
+    assert "[slipcar.problems]\nScenario = slipcar.envs.scenario:Scenario" in entries
+
+
+@pytest.mark.long
+def test_the_wheel_works_without_extras(wheel, tmp_path):
+    """Installed alone in a new environment, which needs the network."""
+    subprocess.run([sys.executable, "-m", "venv", tmp_path], check=True)
+    python = tmp_path / "bin" / "python"
+    pins = ROOT / "constraints.txt"
+    subprocess.run([python, "-m", "pip", "-q", "install", "-c", pins, wheel], check=True)
+    find = "from importlib.util import find_spec; print([n for n in {} if find_spec(n)])"
+    assert run(find.format(EXTRAS), python) == "[]\n"
+    policy = ', __import__("slipcar.baselines").baselines.load_policy()'
+    assert run(WITHOUT_EXTRAS.format(missing=[], policy=policy), python) == "drove\n"
+
+
+# --- what a user's type checker sees -------------------------------------------------------
+
+
+def test_a_users_type_checker_sees_the_types(tmp_path):
+    """A script elsewhere: mypy follows the import, as it would not without `py.typed`."""
+    script = tmp_path / "user.py"
+    script.write_text(
+        "from slipcar.envs import Scenario\n"
+        "from slipcar.planner import plan\n"
+        "p = plan(Scenario.named('paper'))\n"
+        "reveal_type(p)\n"
+        "wrong: int = p.effort\n"
+    )
+    # The project's own settings, because `make lint` has filled the cache under them.
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", script], capture_output=True, text=True, cwd=ROOT
+    )
+    lines = done.stdout.splitlines()
+    assert len(lines) == 3, done.stdout + done.stderr
+    assert lines[0].endswith('user.py:4: note: Revealed type is "slipcar.planner.plan.Plan"')
+    assert "user.py:5: error: Incompatible types in assignment" in lines[1]
