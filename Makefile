@@ -64,6 +64,9 @@ types: $(INSTALLED)  ## mypy over the installed package
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
 compare train bench: export OMP_NUM_THREADS ?= 1
 
+# Compiled once per machine, not once per renewed tree of links.
+export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba
+
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo 'slipcar needs Python >= 3.11: make PYTHON=/path/to/python3' >&2; exit 1; }

@@ -8,6 +8,7 @@ checkpoint.safetensors   network parameters, Adam's moments, the best actor so f
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import json
@@ -48,13 +49,11 @@ class Checkpoint:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages a training result depends on."""
+    """Versions of Python and of the installed packages a training result depends on."""
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
     return found
 
 

@@ -150,30 +150,26 @@ class Plan:
 
     @classmethod
     def _from_file(cls, header: dict[str, Any], arrays: dict[str, Array]) -> Plan:
-        history = _history_from(arrays)
-        multipliers = Multipliers.from_dict(_strip(arrays, "multipliers."))
         return cls(
             status=Status[header["status"]],
-            history=history,
-            multipliers=multipliers,
+            times=arrays["times"],
+            mean=arrays["mean"],
+            controls=arrays["controls"],
+            covariance=arrays["covariance"],
+            effort=header["effort"],
+            obstacle_cost=header["obstacle_cost"],
+            variance=header["variance"],
+            iterations=header["iterations"],
+            history=_history_from(arrays),
+            guess=arrays["guess"],
+            multipliers=Multipliers.from_dict(_strip(arrays, "multipliers.")),
+            A=arrays["A"],
+            B=arrays["B"],
+            gains=arrays.get("gains"),
+            solve_time=header["solve_time"],
             options=header["options"],
             problem=_problem_from_data(header["problem"]),
-            gains=arrays.get("gains"),
-            **{
-                name: arrays[name]
-                for name in ("times", "mean", "controls", "covariance", "guess", "A", "B")
-            },
-            **{
-                name: header[name]
-                for name in (
-                    "effort",
-                    "obstacle_cost",
-                    "variance",
-                    "iterations",
-                    "solve_time",
-                    "message",
-                )
-            },
+            message=header["message"],
         )
 
 

@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Protocol
 
-
 #: Relative accuracy of the merit function and of its decrease by the model.
 _MERIT_NOISE = 1e-8
 

@@ -83,7 +83,7 @@ def test_features_by_hand():
     t, x = 4.0, np.array([1.2, 2.5, math.pi / 6, 0.4, -0.3])
     to_go = np.array([1.0, 0.5, -math.pi / 6, 0.4, -0.3])  # T − t = 1 s
     expected = [
-        *[0.5, 0.25, math.cos(math.pi / 6), 0.5, 0.4, -0.3, 0.6],
+        *[1.0, 0.5, math.cos(math.pi / 6), 0.5, 0.4, -0.3, 0.6],
         *to_go,
     ]
     np.testing.assert_allclose(observe(PAPER, "features", t, x), expected, rtol=1e-6)
