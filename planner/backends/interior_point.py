@@ -11,7 +11,7 @@ s z = μ → 0; linearised and eliminated, each only adds to the LQ problem's di
 
 μ falls the faster the longer the last step was. A hinge that is off has t and its multiplier
 both vanish, which makes the end linear rather than superlinear: the method stops at a gap of
-1e-9 and leaves the last digits to Newton's method.
+1e-9 of the objective and leaves the last digits to Newton's method.
 """
 
 from __future__ import annotations

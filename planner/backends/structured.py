@@ -94,8 +94,12 @@ class StructuredSolver:
             point, more = self._newton(pieces, pieces.near(inner), _POLISHING_SOLVES)
             solves += more
             # The last interior systems are ill-conditioned: judge what the controls really do.
-            candidates = [pieces.replayed(p) for p in (inner, point) if p is not None]
-            point = min(candidates, key=pieces.objective_of)
+            inner = pieces.replayed(inner)
+            best = pieces.objective_of(inner)
+            if point is not None:
+                point = pieces.replayed(point)
+            if point is None or pieces.objective_of(point) > best + 1e-9 * (1.0 + abs(best)):
+                point = inner
         self._active = dataclasses.replace(
             pieces.near(point), terminal=np.ones(len(sub.g), dtype=np.int64)
         )
