@@ -69,7 +69,8 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space = layouts.observation_space(self.scenario, self.observation)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._rngs: list[np.random.Generator] = []
+        self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
+        self._ready = False
         steps = self.scenario.nodes - 1
         # Steps first, so that the noise of one step of all environments is contiguous.
         self._noise = np.empty((steps, self.num_envs, self.substeps, 3))
@@ -110,18 +111,20 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seed = [int(seed) + i for i in range(self.num_envs)]
         if seed is not None and np.asarray(seed, dtype=object).shape != (self.num_envs,):
             raise ValueError(f"seed must be None, an int or {self.num_envs} of them, not {seed!r}")
-        if not self._rngs:
-            self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
         if seed is not None:
             for i in np.flatnonzero(mask):
                 if seed[i] is not None:
                     self._rngs[i] = seeding.np_random(seed[i])[0]
+        self._ready = True
         self._start_episodes(mask)
         return self._observe(), self._info_at_start(mask)
 
     def _start_episodes(self, mask: np.ndarray) -> None:
         for i in np.flatnonzero(mask):
-            self._noise[:, i] = draw_noise(self._rngs[i], self.scenario, self.substeps)
+            rng = self._rngs[i]
+            if rng is None:  # never seeded: from the system's entropy
+                rng = self._rngs[i] = seeding.np_random()[0]
+            self._noise[:, i] = draw_noise(rng, self.scenario, self.substeps)
         self._x[mask] = self.scenario.start
         self._steps[mask] = 0
         self._distance[mask] = self.scenario.signed_distance(self.scenario.start)
@@ -136,7 +139,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ValueError: for misshapen or non-finite actions, naming the index.
             ResetNeeded: before the first reset, or, with DISABLED, where an episode is over.
         """
-        if not self._rngs:
+        if not self._ready:
             raise ResetNeeded("call reset() before step()")
         resetting = self._over
         if self.autoreset_mode is AutoresetMode.DISABLED and resetting.any():
