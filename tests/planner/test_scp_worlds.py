@@ -82,16 +82,17 @@ def test_doubling_slip_and_quartering_the_weight_changes_nothing(paper):
 
 
 def test_refining_the_time_grid_converges_at_first_order():
-    # Forward Euler: halving dt halves the distance to the limit.
-    scenario = Scenario.named("open")
+    # Forward Euler: halving dt halves the distance to the limit. (From rest to rest the problem
+    # looks the same backwards in time and the first-order error cancels; so it starts rolling.)
+    scenario = Scenario.named("open").replace(start=(0.0, 0.0, 0.0, 0.8, 0.0))
     efforts = [
         plan(scenario.replace(nodes=nodes), variance_weight=0.0, tolerance=1e-8).effort
         for nodes in (21, 41, 81, 161, 321)
     ]
     change = np.diff(efforts)
     ratios = change[:-1] / change[1:]
-    assert np.all((ratios > 1.7) & (ratios < 2.3))
-    assert abs(change[-1]) < 2e-3 * efforts[-1]
+    assert np.all((ratios > 1.9) & (ratios < 2.2))
+    assert abs(change[-1]) < 1e-2 * efforts[-1]
 
 
 def test_refining_the_time_grid_with_obstacles(paper):
