@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from array_api_compat import array_namespace
+from slipcar.envs.arrays import array_namespace
 
 #: State, control and Brownian dimensions. σ has three non-zero rows, so three Brownian
 #: motions drive it; SPEC's 5 x 5 diagonal is this matrix with two zero columns dropped.

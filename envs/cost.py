@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from array_api_compat import array_namespace
+from slipcar.envs.arrays import array_namespace
 
 
 def control_power(u: Any) -> Any:

@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 
 from slipcar.envs import car
+from slipcar.envs.arrays import array_namespace
 
 #: Strong order of convergence for this car (see the module's docstring).
 STRONG_ORDER = 1.0

@@ -14,10 +14,11 @@ import json
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import device
 from numpy.typing import ArrayLike
 
 from slipcar.envs import car, cost, worlds
+from slipcar.envs.arrays import array_namespace
 from slipcar.envs.validate import checked_array, checked_float, checked_int
 
 _FORMAT = 1
