@@ -338,12 +338,19 @@ def _merit(settings: Settings, at: _Iterate, found: Solution, rho: float) -> flo
     lin = at.lin
     beyond = lin.g - np.clip(lin.g, -settings.terminal_tolerance, settings.terminal_tolerance)
     price = 0.5 * float(np.max(np.abs(found.adjoint)))
+    nu = found.terminal
+    if np.max(np.abs(nu), initial=0.0) < 0.5 * rho:  # nothing is lacking: as for the defects
+        terminal = (
+            np.sum(nu * beyond) + 0.5 * np.max(np.abs(nu), initial=0.0) * np.abs(beyond).sum()
+        )
+    else:
+        terminal = rho * np.abs(beyond).sum()
     return (
         lin.effort
         + lin.penalty
         + at.variance_value()
         + float(np.sum(found.adjoint * lin.defect) + price * np.sum(np.abs(lin.defect)))
-        + rho * float(np.sum(np.abs(beyond)))
+        + float(terminal)
     )
 
 

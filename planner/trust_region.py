@@ -13,6 +13,8 @@ from typing import Protocol
 
 #: Relative accuracy of the merit function and of its decrease by the model.
 _MERIT_NOISE = 1e-8
+#: Beyond this a step is as short as it can be, and rounding errors take over.
+_LARGEST_MULTIPLIER = 1e8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,12 +110,18 @@ class PaperTrustRegion:
         return self._refused
 
     def fits(self, radius: float) -> bool:
-        """Whether the step keeps Δ (to 1 %, from inside); moves the multiplier if not."""
+        """Whether the step keeps Δ (to 1 %, from inside); moves the multiplier if not.
+
+        Where the dynamics alone demand a longer step (assumption A₃ fails), the shortest there
+        is passes.
+        """
         if radius <= self.radius:
             tight = radius >= 0.99 * self.radius or self.multiplier == 0.0
             if tight or self._high <= 1.0001 * self._low:
                 return True
             self._high = self.multiplier
+        elif self.multiplier >= _LARGEST_MULTIPLIER:
+            return True
         else:
             self._low = self.multiplier
         if self._high == float("inf"):
@@ -158,9 +166,12 @@ class AdaptiveTrustRegion:
             return True
         # The multiplier that makes the penalty as large as what the step promised.
         natural = step.predicted / max(step.radius, 1e-300)
-        # Both decreases carry rounding errors of the merit function, all that is left at the end.
+        # At the end rounding errors are all that is left of both: no reason to change anything.
         noise = _MERIT_NOISE * (1.0 + abs(step.before))
-        ratio = (step.actual + noise) / (step.predicted + noise)
+        if finite and step.predicted <= noise and step.actual >= -noise:
+            self._rejected = 0
+            return True
+        ratio = step.actual / max(step.predicted, 1e-300)
         if not finite or ratio < 1e-3:
             self._rejected += 1
             self.multiplier = max(4.0 * self.multiplier, 0.5 * natural) or 1.0
