@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.provenance import provenance
-from slipcar.evaluation.rollout import Controller, check_controller, rollout
+from slipcar.evaluation.rollout import Controller, check_controller, check_counts, rollout
 from slipcar.evaluation.statistics import paired_difference
 from slipcar.evaluation.store import load_row, row_key, save_row
 
@@ -128,6 +128,7 @@ def compare(
         ValueError: for a bad argument, before anything is run.
     """
     scenario = Scenario.of(scenario)
+    check_counts(episodes, seed, substeps, batch_size, n_jobs)
     if not controllers:
         raise ValueError("compare needs at least one controller, not an empty mapping")
     for name, controller in controllers.items():

@@ -84,6 +84,22 @@ class Rollout:
     inference_time: float
 
 
+def check_counts(
+    episodes: int, seed: int, substeps: int, batch_size: int | None, n_jobs: int
+) -> None:
+    """Check the numbers that say what to run.
+
+    Raises:
+        ValueError: naming the bad one and what is allowed.
+    """
+    checked_int("episodes", episodes, at_least=1)
+    checked_int("seed", seed, at_least=0)
+    checked_int("substeps", substeps, at_least=1)
+    checked_int("n_jobs", n_jobs, at_least=1)
+    if batch_size is not None:
+        checked_int("batch_size", batch_size, at_least=1)
+
+
 def rollout(
     controller: Controller,
     scenario: Scenario | str,
@@ -116,16 +132,13 @@ def rollout(
             names the controller, the step and the episode.
     """
     scenario = Scenario.of(scenario)
-    checked_int("episodes", episodes, at_least=1)
-    checked_int("seed", seed, at_least=0)
-    checked_int("substeps", substeps, at_least=1)
-    checked_int("n_jobs", n_jobs, at_least=1)
+    check_counts(episodes, seed, substeps, batch_size, n_jobs)
     check_controller(controller)
     blocks = -(-episodes // BLOCK)
     if batch_size is None:
         per_task = min(16, -(-blocks // (4 * n_jobs)))  # some tasks a worker, for balance
     else:
-        per_task = -(-checked_int("batch_size", batch_size, at_least=1) // BLOCK)
+        per_task = -(-batch_size // BLOCK)
     tasks = [range(b, min(b + per_task, blocks)) for b in range(0, blocks, per_task)]
     parts, seconds, rows = [], 0.0, 0
     for part, part_seconds in _run(tasks, n_jobs, (controller, scenario, episodes, seed, substeps)):

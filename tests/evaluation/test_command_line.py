@@ -41,6 +41,7 @@ def test_help_teaches(capsys):
         (["simulate", "uber"], "unknown controller 'uber'"),
         (["simulate", "missing.npz"], "missing.npz"),
         (["simulate", "scp", "--episodes", "0"], "episodes must be at least 1, not 0"),
+        (["compare", "--episodes", "0"], "episodes must be at least 1, not 0"),
         (["simulate", "scp", "--episodes", "51", "--gif", "a.gif"], "at most 50"),
         (["simulate", "scp", "--gif", "a.mp4"], "ends in .gif"),
         (["compare", "--policy", "missing"], "missing"),

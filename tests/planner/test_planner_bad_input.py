@@ -186,7 +186,8 @@ def test_control_bounds(bounds):
         ("terminal", lambda x: x / 0.0, "terminal.*must be finite"),
         ("drift_jacobian", lambda t, x, u: (np.zeros((2, 2, 2)), np.zeros((2, 2, 2))),
          r"drift_jacobian\(t, x, u\)\[1\] must have shape \(2, 2, 1\)"),
-        ("diffusion_jacobian", lambda t, x: np.zeros((2, 2, 2)), r"diffusion_jacobian.*\(2, 2, 1, 2\)"),
+        ("diffusion_jacobian", lambda t, x: np.zeros((2, 2, 2)),
+         r"diffusion_jacobian.*\(2, 2, 1, 2\)"),
         ("terminal_jacobian", lambda x: np.zeros((2, 2)), r"terminal_jacobian.*\(2, 2, 2\)"),
     ],
 )  # fmt: skip

@@ -1,0 +1,146 @@
+"""Every contender of `make bench` reaches the cost it is said to; nothing is timed here."""
+
+import contextlib
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slipcar.envs import Scenario
+
+pytest.importorskip("casadi", reason='casadi is not installed: pip install "slipcar[bench]"')
+pytest.importorskip("rich")
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """Imports a module of benchmarks/, which is a folder of scripts and no package."""
+    sys.path.insert(0, str(FOLDER))
+    yield importlib.import_module
+    sys.path.remove(str(FOLDER))
+
+
+@pytest.fixture(scope="module")
+def makers(bench):
+    """Contenders by name on the paper's case; peers in processes that end with the module."""
+    with contextlib.ExitStack() as stack:
+        planners, peers = bench("planners"), bench("peers")
+        yield planners.makers(Scenario.named("paper"), peers.default_python(), stack)
+
+
+def _plan(bench, makers, name):
+    contenders = bench("contenders")
+    try:
+        contender = makers[name]()
+        answer = contender.solve()[1]
+    except (ImportError, contenders.UnavailableError) as missing:
+        pytest.skip(f"{name}: {missing}")
+    return contender, answer, contenders.judge(Scenario.named("paper"), answer.controls)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "slipcar, numba",
+        "slipcar, numba, fine",
+        "slipcar, NumPy/SciPy",
+        "slipcar, NumPy/SciPy, fine",
+        "slipcar, OSQP in place",
+        "slipcar, cvxpy + Clarabel SCP",
+        "slipcar, cvxpy + Clarabel SCP, built once",
+        "CasADi + fatrop",
+        "CasADi + IPOPT",
+        "CasADi + IPOPT, not expanded",
+        pytest.param("CasADi + fatrop, compiled", marks=pytest.mark.long),
+        pytest.param("OpenSCvx", marks=pytest.mark.long),
+    ],
+)
+def test_contender_solves_the_problem(bench, makers, name):
+    contender, answer, judged = _plan(bench, makers, name)
+    controls, optimum = bench("planners").reference()
+    assert contender.solves == bench("contenders").EXACT
+    assert answer.found
+    assert judged.miss < 1e-4
+    assert judged.cost == pytest.approx(optimum, rel=1e-5)
+    np.testing.assert_allclose(answer.controls, controls, atol=5e-3)
+
+
+def test_paper_recipe_ends_at_an_optimum_of_the_problem_with_a_box(bench, makers):
+    # Its dynamics are exact where it stops moving, so it must agree with the whole problem whose
+    # goal is the same box.
+    recipe = bench("paper_recipe")
+    _, answer, judged = _plan(bench, makers, "the paper's recipe, IPOPT")
+    whole = bench("casadi_nlp").WholeNlp(
+        Scenario.named("paper"), terminal_box=recipe.TERMINAL_BOX, tolerance=1e-8
+    )
+    best = whole.answer(whole.solve())
+    optimum = bench("contenders").judge(Scenario.named("paper"), best.controls)
+    assert answer.found
+    assert best.found
+    assert judged.miss < 1.01 * recipe.TERMINAL_BOX
+    assert judged.cost == pytest.approx(optimum.cost, rel=1e-5)
+    assert judged.cost < bench("planners").reference()[1] - 5e-3  # a box is cheaper to reach
+
+
+def test_crocoddyl_reaches_the_cost_but_for_its_penalty(bench, makers):
+    _, answer, judged = _plan(bench, makers, "crocoddyl FDDP")
+    assert answer.found
+    assert judged.miss < 1e-5
+    assert judged.cost == pytest.approx(bench("planners").reference()[1], rel=1e-5)
+
+
+def test_variance_weight_trades_cost_for_variance(bench, makers):
+    _, compiled, judged = _plan(bench, makers, "slipcar, numba, w = 1")
+    _, plain, _ = _plan(bench, makers, "slipcar, NumPy/SciPy, w = 1")
+    assert judged.cost > bench("planners").reference()[1]  # nothing is cheaper than the optimum
+    np.testing.assert_allclose(compiled.controls, plain.controls, atol=1e-6)
+
+
+def test_judge_gives_the_reference_its_cost(bench):
+    controls, optimum = bench("planners").reference()
+    judged = bench("contenders").judge(Scenario.named("paper"), controls)
+    assert judged.cost == pytest.approx(optimum, rel=1e-9)
+    assert judged.miss < 1e-9
+    assert bench("contenders").judge(Scenario.named("paper"), 0.0 * controls).miss > 1.0
+
+
+def test_exponent_of_a_power_law(bench):
+    nodes = np.array([41, 81, 161, 321, 641])
+    slope, intercept = bench("growth").exponent(nodes, 0.3 * nodes**1.25)
+    assert slope == pytest.approx(1.25)
+    assert np.exp(intercept) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("N", [41, 81])
+def test_growth_contenders_agree_at_every_size(bench, N):
+    growth, contenders = bench("growth"), bench("contenders")
+    scenario = Scenario.named("paper").replace(nodes=N)
+    found, _ = contenders.available(growth.makers(scenario))
+    costs = [contenders.judge(scenario, c.solve()[1].controls).cost for c in found]
+    assert len(costs) >= 3
+    np.testing.assert_allclose(costs, costs[-1], rtol=1e-6)
+
+
+def test_what_is_not_installed_is_skipped_with_its_reason(bench):
+    contenders, told = bench("contenders"), []
+
+    def missing():
+        raise ImportError("No module named 'fast_solver'\nand more")
+
+    found, skipped = contenders.available({"fast": missing}, told.append)
+    assert found == []
+    assert skipped == {"fast": "No module named 'fast_solver'"}
+    assert told == ["skipped fast: No module named 'fast_solver'"]
+
+
+def test_worker_that_dies_is_unavailable(bench, tmp_path):
+    peers, contenders = bench("peers"), bench("contenders")
+    script = tmp_path / "dies.py"
+    script.write_text("raise SystemExit('no such device')")
+    worker = peers.Worker(sys.executable, script)
+    with contextlib.closing(worker), pytest.raises(contenders.UnavailableError, match="no such"):
+        worker.ask({})
