@@ -29,7 +29,7 @@ CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
 
-.PHONY: help install compare test test-long train bench lint types lock clean
+.PHONY: help install compare test test-long train bench lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -51,7 +51,7 @@ test-long: $(INSTALLED)  ## the tests that take minutes
 train: $(INSTALLED)  ## train the PPO baseline; runs/ppo
 	$(BIN)/slipcar train $(ARGS)
 
-bench: $(BENCH_INSTALLED)  ## measure planner, environment and evaluation; results/bench.json
+bench: $(BENCH_INSTALLED)  ## time the planner beside its peers, environments, evaluation; results/bench
 	$(BIN)/python benchmarks/run.py $(ARGS)
 
 lint: types  ## ruff (rules and format) and mypy
@@ -87,6 +87,11 @@ $(BENCH_INSTALLED): $(INSTALLED)
 	@echo 'Installing what the benchmarks compare with ...'
 	@$(PIP) -c constraints.txt 'slipcar[bench]'
 	@touch $@
+
+# Their requirements contradict our pins: they run as workers of the benchmark in a venv of their own.
+peers:  ## add crocoddyl and OpenSCvx to `make bench` (2 GB)
+	$(PYTHON) -m venv build/peers
+	build/peers/bin/python -m pip -qq install crocoddyl openscvx
 
 # The newest versions that pyproject.toml admits, tried out in a venv of their own, become the
 # pins. The local part of torch's version is dropped, so that any build of it will do.

@@ -1,86 +1,112 @@
-"""Milliseconds per plan on the paper's case, ours beside CasADi + IPOPT, in one run."""
+"""Milliseconds per plan on the paper's case: slipcar beside its peers, all in turns."""
 
 from __future__ import annotations
 
-import time
+import contextlib
+import importlib
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import ours
+import peers
+from contenders import EXACT, Contender, available, judge
+from turns import Timing, take_turns
 
 from slipcar.envs import Scenario
-from slipcar.planner import Plan, plan
-from slipcar.planner.backends import Solver
-from slipcar.planner.backends.structured import StructuredSolver
 
-IPOPT = "CasADi + IPOPT, whole NLP"
-
-
-#: Called so many times, all contenders in turn, so that a busy machine is shared fairly.
-ROUNDS = 40
-_SLOW, _SLOW_ROUNDS = 0.1, 5
+_REFERENCE = Path(__file__).resolve().parent.parent / "tests" / "data" / "paper_case.json"
+#: Contenders by module: those of a package that is not installed are skipped.
+_MODULES = ("cvxpy_dpp", "casadi_nlp", "paper_recipe")
 
 
-def _solvers() -> dict[str, Callable[[], Plan]]:
+def reference() -> tuple[np.ndarray, float]:
+    """Optimal controls (40, 2) of the paper's case and their cost: IPOPT at 1e-10, stored."""
+    case = json.loads(_REFERENCE.read_text(encoding="utf-8"))["clearance_0.13"]
+    return np.array(case["control"]), case["effort"] + case["obstacle_cost"]
+
+
+def makers(
+    scenario: Scenario, peers_python: str, stack: contextlib.ExitStack
+) -> dict[str, Callable[[], Contender]]:
+    """Every contender, by name."""
+    found = ours.makers(scenario)
+    for module in _MODULES:
+        found |= _makers_of(module, scenario)
+    return found | peers.makers(scenario, peers_python, stack)
+
+
+def measure(rounds: int, peers_python: str) -> tuple[list[Timing], dict[str, str]]:
+    """Timings of all that are available, and why the others are not."""
+    with contextlib.ExitStack() as stack:
+        scenario = Scenario.named("paper")
+        contenders, skipped = available(makers(scenario, peers_python, stack))
+        return take_turns(contenders, rounds, "planners"), skipped
+
+
+def rows(timings: list[Timing]) -> list[dict[str, Any]]:
+    """One row a contender, the fastest first."""
     scenario = Scenario.named("paper")
+    controls, _ = reference()
+    table = []
+    for timing in sorted(timings, key=lambda timing: timing.ms[1]):
+        contender, answer = timing.contender, timing.answer
+        judged = judge(scenario, answer.controls)
+        table.append(
+            {
+                "planner": contender.name,
+                "tolerance": contender.tolerance,
+                **timing.columns(),
+                "effort + obstacle": judged.cost,
+                "misses goal by": judged.miss,
+                "max |u − u*|": float(np.abs(answer.controls - controls).max()),
+                "iterations": answer.iterations,
+                "status": "converged" if answer.found else "not converged",
+                "built in [s]": contender.build_seconds,
+                "runs": len(timing.seconds),
+                "solves": contender.solves,
+            }
+        )
+    return table
 
-    def planner(make: Callable[[], str | Solver], weight: float) -> Callable[[], Plan]:
-        return lambda: plan(scenario, solver=make(), variance_weight=weight)
 
-    return {
-        "slipcar structured (NumPy/SciPy), w = 0": planner(lambda: StructuredSolver(False), 0.0),
-        "slipcar structured (NumPy/SciPy), w = 1": planner(lambda: StructuredSolver(False), 1.0),
-        "slipcar structured (numba), w = 0": planner(lambda: StructuredSolver(True), 0.0),
-        "slipcar structured (numba), w = 1": planner(lambda: StructuredSolver(True), 1.0),
-        "slipcar osqp, w = 0": planner(lambda: "osqp", 0.0),
-        "slipcar cvxpy, w = 0": planner(lambda: "cvxpy", 0.0),
-    }
-
-
-def _ipopt() -> Callable[[], Plan | tuple[bool, float, int]]:
-    from casadi_nlp import CasadiNlp
-
-    return CasadiNlp(Scenario.named("paper")).solve
+def disagreements(timings: list[Timing]) -> list[str]:
+    """Who claims to solve the problem and does not reach its cost to four digits."""
+    scenario = Scenario.named("paper")
+    _, optimum = reference()
+    told = []
+    for timing in timings:
+        judged = judge(scenario, timing.answer.controls)
+        if timing.contender.solves == EXACT and abs(judged.cost - optimum) > 1e-4 * optimum:
+            told.append(f"{timing.contender.name} reaches {judged.cost:.4f}, not {optimum:.4f}")
+    return told
 
 
-def rows(rounds: int = ROUNDS) -> list[dict[str, Any]]:
-    """One row a solver: median and quartiles in ms, cost reached, iterations."""
-    contenders: dict[str, Callable[[], Any]] = dict(_solvers())
+def ratios(timings: list[Timing]) -> list[dict[str, Any]]:
+    """How many times as long as our structured solver the whole-problem ones take, in this run."""
+    median = {timing.contender.name: timing.ms[1] for timing in timings}
+    whole = [name for name in median if name.startswith(("CasADi", "crocoddyl"))]
+    if not whole:
+        return []
+    return [
+        {
+            "planner": f"{timing.contender.name}, {timing.contender.tolerance}",
+            **{name: median[name] / timing.ms[1] for name in whole},
+        }
+        for timing in timings
+        if timing.contender.name.startswith(("slipcar, numba", "slipcar, NumPy"))
+    ]
+
+
+def _makers_of(module: str, scenario: Scenario) -> dict[str, Callable[[], Contender]]:
     try:
-        contenders[IPOPT] = _ipopt()
-    except ImportError as error:
-        print(f"skipped {IPOPT}: {error}")
-    results: dict[str, Any] = {}
-    times: dict[str, list[float]] = {}
-    for name, call in contenders.items():  # warm up: imports, compilation, workspaces
-        try:
-            call()
-            results[name], times[name] = call(), []
-        except ImportError as error:
-            print(f"skipped {name}: {error}")
-    for turn in range(rounds):
-        for name in results:
-            if turn >= _SLOW_ROUNDS and np.median(times[name]) > _SLOW:
-                continue
-            began = time.perf_counter()
-            results[name] = contenders[name]()
-            times[name].append(time.perf_counter() - began)
-    return [_row(name, np.array(times[name]), results[name]) for name in results]
+        return importlib.import_module(module).makers(scenario)
+    except ModuleNotFoundError as error:
+        missing = error
 
+    def unavailable() -> Contender:
+        raise missing
 
-def _row(name: str, times: np.ndarray, result: Plan | tuple[bool, float, int]) -> dict[str, Any]:
-    if isinstance(result, Plan):
-        status, cost, iterations = str(result.status), result.cost, result.iterations
-    else:
-        found, cost, iterations = result
-        status = "CONVERGED" if found else "failed"
-    low, median, high = 1e3 * np.quantile(times, [0.25, 0.5, 0.75])
-    return {
-        "planner": name,
-        "ms (median)": median,
-        "quartiles": f"{low:.2f}–{high:.2f}",
-        "effort + obstacle": cost,
-        "iterations": iterations,
-        "status": status,
-        "runs": len(times),
-    }
+    return {module.replace("_", " "): unavailable}

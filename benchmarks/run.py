@@ -1,48 +1,79 @@
 """All benchmarks in one run on one machine: `make bench`.
 
-Absolute numbers belong to the machine they are printed with; what carries over are ratios
-within the run.
+Absolute numbers belong to the machine they are printed with; what carries over are ratios within
+the run. Tables, figure and every single time go to the folder.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
+import time
 from pathlib import Path
+from typing import Any
 
-import pandas as pd
+import cold
+import growth
+import peers
 import planners
+import report
 import simulation
+import turns
+
+PARTS = ("planners", "growth", "cold", "simulation")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=planners.ROUNDS, help="plans per solver")
-    parser.add_argument("--out", type=Path, default=Path("results/bench.json"), help="JSON file")
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run")
+    parser.add_argument("--rounds", type=int, default=turns.ROUNDS, help="plans per contender")
+    parser.add_argument(
+        "--peers-python",
+        default=peers.default_python(),
+        metavar="PYTHON",
+        help="interpreter that has crocoddyl and OpenSCvx (default: %(default)s)",
+    )
+    parser.add_argument("--folder", type=Path, default=Path("results/bench"), help="for results")
     arguments = parser.parse_args()
-    tables = {
-        "planning, paper case, N = 41, warm": planners.rows(arguments.rounds),
-        "environment, features observation": simulation.environment_rows(),
-        "evaluation": simulation.evaluation_rows(),
-    }
-    cpu = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next(line.split(":")[1].strip() for line in lines if "model name" in line)
-    except (OSError, StopIteration):
-        pass
-    print(f"Python {platform.python_version()}, {cpu}\n")
-    for title, rows in tables.items():
-        print(f"## {title}\n\n{pd.DataFrame(rows).to_markdown(index=False, floatfmt='.4g')}\n")
-    ours = {row["planner"]: row["ms (median)"] for row in next(iter(tables.values()))}
-    ipopt = ours.get(planners.IPOPT)
-    if ipopt is not None:
-        for name in ours:
-            print(f"{name}: {ipopt / ours[name]:.2f} x as fast as CasADi + IPOPT in this run")
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps({"cpu": cpu, "tables": tables}, indent=1))
-    print(f"written: {arguments.out}")
+    if arguments.rounds < 1:
+        parser.error(f"--rounds must be at least 1, not {arguments.rounds}")
+    began = time.perf_counter()
+    tables: dict[str, report.Table] = {}
+    notes: list[str] = []
+    raw: dict[str, Any] = {"rounds": arguments.rounds, "skipped": {}, "seconds": {}}
+
+    if "planners" in arguments.only:
+        timings, skipped = planners.measure(arguments.rounds, arguments.peers_python)
+        tables["Planning, paper case, N = 41, warm"] = planners.rows(timings)
+        tables["How many times as long as ours the others take"] = planners.ratios(timings)
+        notes += planners.disagreements(timings)
+        raw["skipped"] |= skipped
+        raw["seconds"]["planners"] = {
+            f"{t.contender.name}, {t.contender.tolerance}": t.seconds.tolist() for t in timings
+        }
+    if "growth" in arguments.only:
+        curves, skipped = growth.measure(max(arguments.rounds // 2, 1))
+        tables["Growth with the number of nodes"] = growth.rows(curves)
+        tables["Exponents p of ms ∝ N^p"] = growth.fits(curves)
+        raw["skipped"] |= skipped
+        raw["seconds"]["growth"] = {
+            curve.name: {
+                N: t.seconds.tolist() for N, t in zip(curve.nodes, curve.timings, strict=True)
+            }
+            for curve in curves
+        }
+        notes += [f"Figure: {path}" for path in growth.draw(curves, arguments.folder)]
+    if "cold" in arguments.only:
+        tables["Cold start"] = cold.rows()
+    if "simulation" in arguments.only:
+        tables["Environment, features observation"] = simulation.environment_rows()
+        tables["Evaluation"] = simulation.evaluation_rows()
+
+    notes += [f"skipped {name}: {why}" for name, why in raw["skipped"].items()]
+    told = report.where()
+    text = report.markdown(tables, told, notes)
+    print(text)
+    written = report.save(arguments.folder, tables, told, text, raw)
+    print(f"written: {', '.join(map(str, written))} ({time.perf_counter() - began:.0f} s)")
 
 
 if __name__ == "__main__":
