@@ -112,13 +112,11 @@ class Subproblem:
 
     def objective(self, d: Array, e: Array) -> float:
         """Value at deviations d (K, n) of nodes 1..K and e (K, m)."""
-        hinge = np.maximum(np.einsum("kpn,kn->kp", self.a, d) + self.b, 0.0)
+        hinge = np.maximum((self.a @ d[..., None])[..., 0] + self.b, 0.0)
         return float(
-            0.5 * np.einsum("ki,kij,kj", e, self.R, e)
-            + np.sum(self.r * e)
-            + 0.5 * np.einsum("ki,kij,kj", d, self.Q, d)
-            + np.sum(self.q * d)
-            + 0.5 * np.sum(self.h * hinge**2)
+            np.vdot(e, 0.5 * (self.R @ e[..., None])[..., 0] + self.r)
+            + np.vdot(d, 0.5 * (self.Q @ d[..., None])[..., 0] + self.q)
+            + 0.5 * np.vdot(self.h, hinge * hinge)
             + self.rho * self.virtual_control(d)
         )
 

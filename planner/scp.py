@@ -11,11 +11,13 @@ the step alone says little about the path.
 
 The merit function that steps are judged by is
 
-    Φ = effort + penalty + w ∫ tr Σ dt + Σ λᵀf + ½ max|λ| ‖f‖₁ + ρ ‖g‖₁ (beyond its tolerance)
+    Φ = effort + penalty + w ∫ tr Σ dt + Σ λᵀf + ½ max|λ| ‖f‖₁ + νᵀg + ½ max|ν| ‖g‖₁
 
-with f the defects of the non-linear dynamics and λ their multipliers from the sub-problem.
-Pricing defects by λ, with its sign, is what keeps good steps from being rejected near the
-solution (Maratos): the defect that a step leaves is of second order, and so is its gain.
+with f the defects of the non-linear dynamics, g the terminal residual (beyond its tolerance) and
+λ, ν their multipliers from the sub-problem. Pricing them by multipliers, with their signs, is
+what keeps good steps from being rejected near the solution (Maratos): the defect that a step
+leaves is of second order, and so is its gain. While something is lacking (ν at its limit ρ) the
+last two terms are ρ ‖g‖₁.
 """
 
 from __future__ import annotations
@@ -338,13 +340,10 @@ def _merit(settings: Settings, at: _Iterate, found: Solution, rho: float) -> flo
     lin = at.lin
     beyond = lin.g - np.clip(lin.g, -settings.terminal_tolerance, settings.terminal_tolerance)
     price = 0.5 * float(np.max(np.abs(found.adjoint)))
-    nu = found.terminal
-    if np.max(np.abs(nu), initial=0.0) < 0.5 * rho:  # nothing is lacking: as for the defects
-        terminal = (
-            np.sum(nu * beyond) + 0.5 * np.max(np.abs(nu), initial=0.0) * np.abs(beyond).sum()
-        )
-    else:
-        terminal = rho * np.abs(beyond).sum()
+    nu, size = found.terminal, float(np.max(np.abs(found.terminal), initial=0.0))
+    lacking = size > 0.5 * rho
+    terminal = np.sum(0.0 if lacking else nu * beyond)
+    terminal += (rho if lacking else 0.5 * size) * np.sum(np.abs(beyond))
     return (
         lin.effort
         + lin.penalty

@@ -20,7 +20,7 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.backends.kkt import BandedKkt, Point, Rows
+from slipcar.planner.backends.kkt import BandedKkt, Point
 from slipcar.planner.convexify import Subproblem
 
 Array = np.ndarray
@@ -153,13 +153,6 @@ def _direction(
     omega = g1 * (sub.h + g2) / D
     c = p.t - p.above
     force = mu / p.above - g1 * rest / D - omega * (c - sub.b)
-    K, hinges = sub.b.shape
-    rows = Rows(
-        node=np.repeat(np.arange(K), hinges),
-        a=sub.a.reshape(-1, sub.a.shape[2]),
-        weight=omega.ravel(),
-        linear=force.ravel(),
-    )
     # Terminal slacks and the box.
     soft = p.plus / p.z_plus + p.minus / p.z_minus
     right = -sub.g + mu / p.z_plus - mu / p.z_minus - soft * point.terminal
@@ -168,7 +161,7 @@ def _direction(
         lean = (mu / p.low - mu / p.high) / W
         soft, right = soft + 1.0 / W, right + w + lean
     held = np.ones(len(sub.g), dtype=bool)
-    target = kkt.solve(rows, held, -soft, right, (over_l + over_u, push))
+    target = kkt.solve(omega, force, held, -soft, right, (over_l + over_u, push))
     if target is None:
         return None
     de = target.e - point.e

@@ -49,23 +49,6 @@ class Point:
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class Rows:
-    """Rank-one terms ½ w (aᵀd)² + l aᵀd on single nodes, added to Q and q.
-
-    Attributes:
-        node: row of Q, (rows,).
-        a: (rows, n).
-        weight: w, (rows,).
-        linear: l, (rows,).
-    """
-
-    node: Array
-    a: Array
-    weight: Array
-    linear: Array
-
-
 class BandedKkt:
     """The matrix in LAPACK band storage, with index arrays computed once per shape."""
 
@@ -82,7 +65,7 @@ class BandedKkt:
         self._at_A = self._flat(node[1:] + i, node[1:] - n + j)
         self._at_AT = self._flat(node[1:] - n + i, node[1:] + j)
         k = np.arange(n)
-        self._at_minus_I = np.concatenate(
+        at_minus_I = np.concatenate(
             [
                 self._flat(node[..., 0] + k, node[..., 0] + n + k).ravel(),
                 self._flat(node[..., 0] + n + k, node[..., 0] + k).ravel(),
@@ -93,6 +76,9 @@ class BandedKkt:
         self._at_G = self._flat(end + r[:, None], last + k[None, :])
         self._at_GT = self._flat(last + k[None, :], end + r[:, None])
         self._at_nu = self._flat(end + r, end + r)
+        # Transposed: LAPACK reads it column by column. Every load overwrites the same entries.
+        self._base = np.zeros((self.size, self.rows))
+        self._base.reshape(-1)[at_minus_I] = -1.0
 
     def _flat(self, row: Array, column: Array) -> Array:
         return column * self.rows + (2 * self.width + row - column)
@@ -100,21 +86,19 @@ class BandedKkt:
     def load(self, sub: Subproblem) -> None:
         """Take a sub-problem: fill in what its pieces do not change."""
         self._sub = sub
-        # Transposed: LAPACK reads it column by column.
-        self._base = np.zeros((self.size, self.rows))
         flat = self._base.reshape(-1)
         self._R_inverse = np.linalg.inv(sub.R)
         self._gain = sub.B @ self._R_inverse
         flat[self._at_S] = -(self._gain @ sub.B.swapaxes(1, 2))
-        flat[self._at_Q] = sub.Q
+        self._rows = sub.a.swapaxes(1, 2)
         flat[self._at_A] = sub.A[1:]
         flat[self._at_AT] = sub.A[1:].swapaxes(1, 2)
-        flat[self._at_minus_I] = -1.0
         flat[self._at_GT] = sub.G
 
     def solve(
         self,
-        rows: Rows,
+        weight: Array,
+        force: Array,
         held: Array,
         nu_diagonal: Array,
         nu_right: Array,
@@ -123,7 +107,8 @@ class BandedKkt:
         """The LQ problem's solution, or None if the matrix is singular or overflows.
 
         Args:
-            rows: hinge pieces.
+            weight: w of the hinge rows, (K, p): adds ½ w (aᵀd)².
+            force: l of the hinge rows, (K, p): adds l aᵀd.
             held: which terminal rows read (G d)_j − δ_j ν_j = s_j, (q,) bool; the others read
                 δ_j ν_j = s_j.
             nu_diagonal: −δ for held rows, δ for others, (q,).
@@ -143,12 +128,8 @@ class BandedKkt:
             R_inverse = np.linalg.inv(R)
             gain = sub.B @ R_inverse
             flat[self._at_S] = -(gain @ sub.B.swapaxes(1, 2))
-        linear = sub.q
-        if len(rows.node):
-            linear = linear.copy()
-            square = rows.weight[:, None, None] * rows.a[:, :, None] * rows.a[:, None, :]
-            np.add.at(flat, self._at_Q[rows.node], square)
-            np.add.at(linear, rows.node, rows.linear[:, None] * rows.a)
+        flat[self._at_Q] = sub.Q + self._rows @ (weight[..., None] * sub.a)
+        linear = sub.q + (self._rows @ force[..., None])[..., 0]
         flat[self._at_G] = np.where(held[:, None], sub.G, 0.0)
         flat[self._at_nu] = nu_diagonal
         right = np.empty((self.size, 1))

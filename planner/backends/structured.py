@@ -20,13 +20,14 @@ import numpy as np
 
 from slipcar.planner.backends import Solution, failed
 from slipcar.planner.backends.interior_point import interior_point
-from slipcar.planner.backends.kkt import BandedKkt, Point, Rows
+from slipcar.planner.backends.kkt import BandedKkt, Point
 from slipcar.planner.convexify import Subproblem
 
 Array = np.ndarray
 
-#: Solves before the interior point takes over, and those it leaves for polishing.
-_SOLVES, _POLISHING_SOLVES = 20, 8
+#: Solves before the interior point takes over: so many and one more for each `_NODES` nodes (the
+#: first sub-problem needs 8 at 41 nodes, 15 at 321, 20 at 481); and those it leaves for polishing.
+_SOLVES, _NODES, _POLISHING_SOLVES = 20, 16, 8
 #: Active bounds are held by a weight so much stiffer than the cost of control: the control
 #: passes its bound by 1e-12 of what its multiplier would make of it, and is clipped in the end.
 _BOUND_WIDTH = 1e-12
@@ -47,8 +48,13 @@ class _ActiveSet:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _ActiveSet) and all(
-            np.array_equal(getattr(self, f.name), getattr(other, f.name))
-            for f in dataclasses.fields(self)
+            a is b or bool((a == b).all())
+            for a, b in (
+                (self.hinge, other.hinge),
+                (self.terminal, other.terminal),
+                (self.lower, other.lower),
+                (self.upper, other.upper),
+            )
         )
 
 
@@ -83,8 +89,9 @@ class StructuredSolver:
         active = self._active
         if active is None or active.hinge.shape != sub.b.shape:
             active = pieces.none()
-        point, solves = self._newton(pieces, active, _SOLVES)
-        if point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho:
+        point, solves = self._newton(pieces, active, _SOLVES + len(sub.f) // _NODES)
+        interior = point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho
+        if point is None or interior:
             kkt.load(sub)
             inner, more = interior_point(sub, kkt)
             solves += more
@@ -100,8 +107,9 @@ class StructuredSolver:
                 point = pieces.replayed(point)
             if point is None or pieces.objective_of(point) > best + 1e-9 * (1.0 + abs(best)):
                 point = inner
+        held = np.ones(len(sub.g), dtype=np.int64)
         self._active = dataclasses.replace(
-            pieces.near(point), terminal=np.ones(len(sub.g), dtype=np.int64)
+            pieces.near(point) if interior else pieces.active_set(point, held), terminal=held
         )
         e = np.clip(point.e, sub.lower, sub.upper) if pieces.bounded else point.e
         return Solution(
@@ -145,23 +153,27 @@ def _newton(
 ) -> tuple[Point | None, int]:
     """The point that lies on the pieces it was computed with, if found; and the solves taken."""
     point: Point | None = None
-    value = np.inf
+    value: float | None = None  # of the point; found only when a second solve asks for it
     for solves in range(1, limit + 1):
         target = kkt.solve(*pieces.lq(active))
         if target is None:
             return None, solves
-        target_value = pieces.objective(target)
-        step = 1.0
-        if point is not None and target_value > value:
-            step = pieces.line_search(point, target)
-        if point is None or step > 1.0 - 1e-10:
-            step, point, value = 1.0, target, target_value
+        found = pieces.active_set(target, active.terminal)
+        if found == active:
+            return target, solves
+        if point is None:
+            point = target
         else:
-            point = point.towards(target, step)
-            value = pieces.objective(point)
-        found = pieces.active_set(point, active.terminal)
-        if step == 1.0 and found == active:
-            return point, solves
+            if value is None:
+                value = pieces.objective(point)
+            target_value = pieces.objective(target)
+            step = 1.0 if target_value <= value else pieces.line_search(point, target)
+            if step > 1.0 - 1e-10:
+                point, value = target, target_value
+            else:
+                point = point.towards(target, step)
+                value = pieces.objective(point)
+                found = pieces.active_set(point, active.terminal)
         active = found
     return None, limit
 
@@ -172,7 +184,8 @@ class _Pieces:
     def __init__(self, sub: Subproblem) -> None:
         self.sub = sub
         self.bounded = sub.bounded
-        self.stiffness = float(np.max(np.einsum("kii->ki", sub.R))) / _BOUND_WIDTH
+        self._off = np.zeros(sub.r.shape, dtype=bool)
+        self.stiffness = float(np.einsum("kii->ki", sub.R).max()) / _BOUND_WIDTH
         # Keeps the matrix regular where the linearised dynamics cannot reach a direction: the
         # multiplier then comes out beyond ρ.
         self.softness = (
@@ -181,20 +194,17 @@ class _Pieces:
 
     def none(self) -> _ActiveSet:
         """No hinge, no bound, the terminal condition held."""
-        sub, off = self.sub, np.zeros(self.sub.r.shape, dtype=bool)
-        held = np.ones(len(sub.g), dtype=np.int64)
-        return _ActiveSet(np.zeros(sub.b.shape, dtype=bool), off, off, held)
+        held = np.ones(len(self.sub.g), dtype=np.int64)
+        return _ActiveSet(np.zeros(self.sub.b.shape, dtype=bool), self._off, self._off, held)
 
     def hinge_arguments(self, d: Array) -> Array:
         """Linearised c at nodes 1..K, (K, p)."""
         return np.matmul(self.sub.a, d[..., None])[..., 0] + self.sub.b
 
-    def lq(self, active: _ActiveSet) -> tuple[Rows, Array, Array, Array, tuple | None]:
+    def lq(self, active: _ActiveSet) -> tuple[Array, Array, Array, Array, Array, tuple | None]:
         """What the LQ problem of an active set adds; arguments of `BandedKkt.solve`."""
         sub = self.sub
-        node, which = np.nonzero(active.hinge)
-        h = sub.h[node, which]
-        rows = Rows(node, sub.a[node, which], h, h * sub.b[node, which])
+        weight = sub.h * active.hinge
         held = np.abs(active.terminal) == 1
         diagonal = np.where(held, -self.softness, 1.0)
         side = np.sign(active.terminal) * sub.tolerance - sub.g
@@ -206,7 +216,7 @@ class _Pieces:
                 stiff = self.stiffness * at_bound
                 bound = np.where(active.upper, sub.upper, np.where(active.lower, sub.lower, 0.0))
                 control = (stiff, -stiff * bound)
-        return rows, held, diagonal, right, control
+        return weight, weight * sub.b, held, diagonal, right, control
 
     def active_set(self, point: Point, before: Array) -> _ActiveSet:
         """Pieces a Newton point lies on; `before` are the terminal pieces it was computed with."""
@@ -249,10 +259,9 @@ class _Pieces:
 
     def _with_terminal(self, point: Point, terminal: Array) -> _ActiveSet:
         sub = self.sub
+        lower = upper = self._off
         if self.bounded:
             lower, upper = point.e < sub.lower, point.e > sub.upper
-        else:
-            lower = upper = np.zeros(sub.r.shape, dtype=bool)
         return _ActiveSet(self.hinge_arguments(point.d) > 0.0, lower, upper, terminal)
 
     def objective(self, point: Point) -> float:
@@ -291,6 +300,10 @@ class _Pieces:
         square = float(np.vdot(de, R_de) + np.vdot(dd, Q_dd))
         c = self.hinge_arguments(a.d)
         dc = self.hinge_arguments(b.d) - c
+        # Between two points inside the bounds all are inside.
+        bounded = self.bounded and any(
+            (p.e > sub.upper).any() or (p.e < sub.lower).any() for p in (a, b)
+        )
 
         def slope(t: float) -> tuple[float, float]:
             """Derivative along the step and, piecewise constant, its own derivative."""
@@ -298,7 +311,7 @@ class _Pieces:
             push = sub.h * dc * (argument > 0.0)
             value = linear + t * square + float(np.vdot(push, argument))
             change = square + float(np.vdot(push, dc))
-            if self.bounded:
+            if bounded:
                 e = a.e + t * de
                 high, low = e - sub.upper, sub.lower - e
                 over = np.where(high > 0.0, high, np.where(low > 0.0, -low, 0.0))

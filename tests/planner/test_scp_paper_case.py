@@ -67,7 +67,8 @@ def test_multipliers_satisfy_the_adjoint_equation_of_the_non_linear_problem(
     assert c.any()
     C = paper.penalty_jacobian(p.times, p.mean)
     force = 2.0 * paper.dt * np.einsum("p,kp,kpn->kn", paper.penalty_weight, c, C)
-    for k in range(1, len(p.times) - 1):
+    force[0] = 0.0  # nothing is charged at the start
+    for k in range(len(p.times) - 1):
         expected = p.A[k].T @ m.adjoint[k + 1] - force[k]
         np.testing.assert_allclose(m.adjoint[k], expected, atol=1e-5)
 
@@ -213,3 +214,12 @@ def test_repr_and_status_read_well(exact_paper_plan):
     assert str(exact_paper_plan.status) == "CONVERGED"
     assert "CONVERGED" in repr(exact_paper_plan)
     assert "effort=4.39823" in repr(exact_paper_plan)
+
+
+def test_a_guess_beyond_the_bounds_is_taken_at_the_bounds(paper):
+    x, _ = paper.initial_guess()
+    u = 10.0 * np.random.default_rng(0).normal(size=(40, 2))
+    inside = np.clip(u, -paper.control_bounds, paper.control_bounds)
+    a, b = (plan(paper, guess=(x, v), max_iterations=1) for v in (u, inside))
+    np.testing.assert_array_equal(a.controls, b.controls)
+    assert a.history[0].step == b.history[0].step
