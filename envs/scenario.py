@@ -282,7 +282,10 @@ class Scenario:
         fraction = (self.times / self.horizon)[:, None]
         x = self.start + fraction * (self.goal - self.start)
         offset = self.goal[:2] - self.start[:2]
-        x[:, 2] = np.arctan2(offset[1], offset[0])
+        # Of all headings along the line, 2π apart, the one nearest those of both ends.
+        middle = 0.5 * (self.start[2] + self.goal[2])
+        heading = np.arctan2(offset[1], offset[0])
+        x[:, 2] = heading + 2.0 * np.pi * np.round((middle - heading) / (2.0 * np.pi))
         x[:, 3] = np.hypot(*offset) / self.horizon
         x[:, 4] = 0.0
         x[0] = self.start

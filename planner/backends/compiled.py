@@ -19,7 +19,7 @@ import numpy as np
 
 Array = np.ndarray
 
-_STEP_PRECISION = 1e-3  # as in structured.py
+_STEP_PRECISION, _WHOLE_STEPS = 1e-3, 10  # as in structured.py
 
 
 @numba.njit(cache=True, fastmath=False)
@@ -322,7 +322,7 @@ def newton(
         _arguments(a, b, d_to, c_to)
         target_value = _objective(Q, q, R, r, h, lower, upper, stiffness, c_to, d_to, e_to)
         step = 1.0
-        if solves > 1 and target_value > value:
+        if solves > _WHOLE_STEPS and target_value > value:
             step = _line_search(Q, q, R, r, h, lower, upper, stiffness, c, d, e, c_to, d_to, e_to)
         if solves == 1 or step > 1.0 - 1e-10:
             step, value = 1.0, target_value

@@ -4,10 +4,10 @@ The sub-problem is a linear-quadratic problem but for convex piecewise quadratic
 control bounds and the exact terminal penalty. Which piece each of them is on is the *active
 set*; given it, the optimality conditions are linear (:mod:`.kkt`). The solution says which
 pieces it lies on; when they are the assumed ones, it is the optimum, to machine precision.
-Full steps settle this in one to six solves as a rule; where one would raise the convex
-objective, an exact line search shortens it. What does not settle soon (many bounds active, a
-terminal condition that cannot be met) goes to :mod:`.interior_point`, whose solution's active
-set is then polished here.
+Whole steps settle this in one to seven solves as a rule; where they do not, an exact line search
+on the convex objective shortens those that would raise it. What does not settle soon (many
+bounds active, a terminal condition that cannot be met) goes to :mod:`.interior_point`, whose
+solution's active set is then polished here.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ Array = np.ndarray
 #: Solves before the interior point takes over: so many and one more for each `_NODES` nodes (the
 #: first sub-problem needs 8 at 41 nodes, 15 at 321, 20 at 481); and those it leaves for polishing.
 _SOLVES, _NODES, _POLISHING_SOLVES = 20, 16, 8
+#: So many steps are whole, whatever they do to the objective: most searches end within them.
+_WHOLE_STEPS = 10
 #: Active bounds are held by a weight so much stiffer than the cost of control: the control
 #: passes its bound by 1e-12 of what its multiplier would make of it, and is clipped in the end.
 _BOUND_WIDTH = 1e-12
@@ -59,7 +61,7 @@ class _ActiveSet:
 
 
 class StructuredSolver:
-    """Solver for sub-problems of one shape; remembers the last active set as a warm start.
+    """Solver for sub-problems of one shape; remembers the last active bounds as a warm start.
 
     Args:
         compiled: run Newton's method compiled by numba (:mod:`.compiled`), the same steps to
@@ -86,9 +88,7 @@ class StructuredSolver:
         if self._kkt is None or self._kkt.shape != shape:
             self._kkt, self._active = BandedKkt(*shape), None
         kkt, pieces = self._kkt, _Pieces(sub)
-        active = self._active
-        if active is None or active.hinge.shape != sub.b.shape:
-            active = pieces.none()
+        active = pieces.start(self._active)
         point, solves = self._newton(pieces, active, _SOLVES + len(sub.f) // _NODES)
         interior = point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho
         if point is None or interior:
@@ -107,10 +107,7 @@ class StructuredSolver:
                 point = pieces.replayed(point)
             if point is None or pieces.objective_of(point) > best + 1e-9 * (1.0 + abs(best)):
                 point = inner
-        held = np.ones(len(sub.g), dtype=np.int64)
-        self._active = dataclasses.replace(
-            pieces.near(point) if interior else pieces.active_set(point, held), terminal=held
-        )
+        self._active = pieces.near(point) if interior else pieces.active_set(point, active.terminal)
         e = np.clip(point.e, sub.lower, sub.upper) if pieces.bounded else point.e
         return Solution(
             found=True,
@@ -161,7 +158,7 @@ def _newton(
         found = pieces.active_set(target, active.terminal)
         if found == active:
             return target, solves
-        if point is None:
+        if point is None or solves <= _WHOLE_STEPS:
             point = target
         else:
             if value is None:
@@ -192,10 +189,13 @@ class _Pieces:
             _TERMINAL_WIDTH * max(1.0, float(np.max(np.abs(sub.g), initial=0.0))) / sub.rho
         )
 
-    def none(self) -> _ActiveSet:
-        """No hinge, no bound, the terminal condition held."""
+    def start(self, last: _ActiveSet | None) -> _ActiveSet:
+        """The hinges on at the iterate, the bounds of the last solution, the condition held."""
         held = np.ones(len(self.sub.g), dtype=np.int64)
-        return _ActiveSet(np.zeros(self.sub.b.shape, dtype=bool), self._off, self._off, held)
+        lower = upper = self._off
+        if last is not None and self.bounded:
+            lower, upper = last.lower, last.upper
+        return _ActiveSet(self.sub.b > 0.0, lower, upper, held)
 
     def hinge_arguments(self, d: Array) -> Array:
         """Linearised c at nodes 1..K, (K, p)."""

@@ -36,7 +36,7 @@ def turned(scenario, angle, shift):
     return moved, lambda path: np.array([pose(x) for x in path])
 
 
-@pytest.mark.parametrize("angle", [0.5, 2.0, -1.0, -2.5])
+@pytest.mark.parametrize("angle", [0.5, 2.0, 3.0, 10.0, -1.0, -2.5])
 def test_a_turned_and_shifted_world_has_the_same_plan(paper, angle):
     world, move = turned(paper, angle, np.array([3.0, -7.0]))
     p, q = plan(paper, tolerance=1e-10), plan(world, tolerance=1e-10)
