@@ -155,8 +155,8 @@ def linearize(model: Model, x: Array, u: Array) -> Linearization:
         C=np.asarray(model.penalty_jacobian(t[1:], x[1:])),
         g=np.asarray(model.terminal(x[-1])),
         G=np.asarray(model.terminal_jacobian(x[-1])),
-        effort=float(np.einsum("k,ki,ij,kj", model.dt, u, model.R, u)),
-        penalty=float(np.einsum("k,p,kp", model.dt, model.weight, np.maximum(c, 0.0) ** 2)),
+        effort=float(np.vdot(dt * u, u @ model.R)),
+        penalty=float(np.vdot(dt * model.weight, np.maximum(c, 0.0) ** 2)),
     )
 
 

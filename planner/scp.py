@@ -188,7 +188,7 @@ def iterate(
         predicted = before - _model_merit(model, settings, at, sub, found)
         used = trust.multiplier
         accepted = trust.judge(Step(radius, max(predicted, 0.0), actual, after, before))
-        step = float(np.einsum("k,ki,ki", model.dt, found.e, found.e))
+        step = float(np.vdot(model.dt[:, None] * found.e, found.e))
         done = time.perf_counter()
         history.append(
             Iteration(
@@ -266,8 +266,8 @@ def _inconsistency(settings: Settings, at: Linearization, lacking: float) -> flo
     """
     gap, worst = np.zeros(at.x.shape[1]), 0.0
     for A, defect in zip(at.A, at.defect, strict=True):
-        gap = A @ gap + defect
-        worst = max(worst, float(np.max(np.abs(gap))))
+        gap = A.dot(gap) + defect
+        worst = max(worst, np.abs(gap).max())
     beyond = np.maximum(np.abs(at.g) - settings.terminal_tolerance, 0.0)
     return max(worst, abs(float(beyond.sum()) - lacking))
 
@@ -342,13 +342,13 @@ def _merit(settings: Settings, at: _Iterate, found: Solution, rho: float) -> flo
     price = 0.5 * float(np.max(np.abs(found.adjoint)))
     nu, size = found.terminal, float(np.max(np.abs(found.terminal), initial=0.0))
     lacking = size > 0.5 * rho
-    terminal = np.sum(0.0 if lacking else nu * beyond)
-    terminal += (rho if lacking else 0.5 * size) * np.sum(np.abs(beyond))
+    terminal = 0.0 if lacking else np.vdot(nu, beyond)
+    terminal += (rho if lacking else 0.5 * size) * np.abs(beyond).sum()
     return (
         lin.effort
         + lin.penalty
         + at.variance_value()
-        + float(np.sum(found.adjoint * lin.defect) + price * np.sum(np.abs(lin.defect)))
+        + float(np.vdot(found.adjoint, lin.defect) + price * np.abs(lin.defect).sum())
         + float(terminal)
     )
 
@@ -359,15 +359,15 @@ def _model_merit(
 ) -> float:
     """Merit of the step by the convex model: no defects, the trust region's term left out."""
     u = at.lin.u + found.e
-    value = float(np.einsum("k,ki,ij,kj", model.dt, u, model.R, u))
+    value = float(np.vdot(model.dt[:, None] * u, u @ model.R))
     value += sub.rho * sub.virtual_control(found.d)
     if at.variance is not None:
         d = found.d[:-1]
         value += at.variance.value + float(np.sum(at.variance.gradient[1:] * d))
         value += 0.5 * float(np.einsum("ki,kij,kj", d, at.variance.hessian[1:], d))
     if settings.composite:
-        c = np.maximum(np.einsum("kpn,kn->kp", sub.a, found.d) + sub.b, 0.0)
-        value += 0.5 * float(np.sum(sub.h * c**2))
+        c = np.maximum((sub.a @ found.d[..., None])[..., 0] + sub.b, 0.0)
+        value += 0.5 * float(np.vdot(sub.h, c * c))
     else:
         value += at.lin.penalty
         slope = 2.0 * model.dt[:, None] * model.weight * np.maximum(at.lin.c, 0.0)
