@@ -79,12 +79,15 @@ class BandedKkt:
         # Transposed: LAPACK reads it column by column. Every load overwrites the same entries.
         self._base = np.zeros((self.size, self.rows))
         self._base.reshape(-1)[at_minus_I] = -1.0
+        self._sub: Subproblem | None = None
 
     def _flat(self, row: Array, column: Array) -> Array:
         return column * self.rows + (2 * self.width + row - column)
 
     def load(self, sub: Subproblem) -> None:
-        """Take a sub-problem: fill in what its pieces do not change."""
+        """Take a sub-problem: fill in what its pieces do not change (once)."""
+        if sub is self._sub:
+            return
         self._sub = sub
         flat = self._base.reshape(-1)
         self._R_inverse = np.linalg.inv(sub.R)
@@ -117,6 +120,7 @@ class BandedKkt:
         """
         K, n, _ = self.shape
         sub = self._sub
+        assert sub is not None, "load a sub-problem first"
         band = self._base.copy()
         flat = band.reshape(-1)
         r, R_inverse, gain = sub.r, self._R_inverse, self._gain

@@ -73,7 +73,7 @@ class StructuredSolver:
 
     def __init__(self, compiled: bool | None = None) -> None:
         self._kkt: BandedKkt | None = None
-        self._active: _ActiveSet | None = None
+        self._bounds: tuple[Array, Array] | None = None
         self._compiled: ModuleType | None = None
         if compiled is not False:
             try:
@@ -86,9 +86,9 @@ class StructuredSolver:
         """Solve one sub-problem; see the module's docstring."""
         shape = (*sub.f.shape, len(sub.g))
         if self._kkt is None or self._kkt.shape != shape:
-            self._kkt, self._active = BandedKkt(*shape), None
+            self._kkt, self._bounds = BandedKkt(*shape), None
         kkt, pieces = self._kkt, _Pieces(sub)
-        active = pieces.start(self._active)
+        active = pieces.start(self._bounds)
         point, solves = self._newton(pieces, active, _SOLVES + len(sub.f) // _NODES)
         interior = point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho
         if point is None or interior:
@@ -96,7 +96,7 @@ class StructuredSolver:
             inner, more = interior_point(sub, kkt)
             solves += more
             if inner is None:
-                self._active = None
+                self._bounds = None
                 return failed(sub, solves, f"not solved after {solves} LQ solves")
             point, more = self._newton(pieces, pieces.near(inner), _POLISHING_SOLVES)
             solves += more
@@ -107,7 +107,7 @@ class StructuredSolver:
                 point = pieces.replayed(point)
             if point is None or pieces.objective_of(point) > best + 1e-9 * (1.0 + abs(best)):
                 point = inner
-        self._active = pieces.near(point) if interior else pieces.active_set(point, active.terminal)
+        self._bounds = pieces.bounds_near(point) if interior else pieces.bounds_at(point)
         e = np.clip(point.e, sub.lower, sub.upper) if pieces.bounded else point.e
         return Solution(
             found=True,
@@ -150,7 +150,7 @@ def _newton(
 ) -> tuple[Point | None, int]:
     """The point that lies on the pieces it was computed with, if found; and the solves taken."""
     point: Point | None = None
-    value: float | None = None  # of the point; found only when a second solve asks for it
+    value: float | None = None  # of the point; found only when a line search may be needed
     for solves in range(1, limit + 1):
         target = kkt.solve(*pieces.lq(active))
         if target is None:
@@ -189,13 +189,10 @@ class _Pieces:
             _TERMINAL_WIDTH * max(1.0, float(np.max(np.abs(sub.g), initial=0.0))) / sub.rho
         )
 
-    def start(self, last: _ActiveSet | None) -> _ActiveSet:
+    def start(self, bounds: tuple[Array, Array] | None) -> _ActiveSet:
         """The hinges on at the iterate, the bounds of the last solution, the condition held."""
         held = np.ones(len(self.sub.g), dtype=np.int64)
-        lower = upper = self._off
-        if last is not None and self.bounded:
-            lower, upper = last.lower, last.upper
-        return _ActiveSet(self.sub.b > 0.0, lower, upper, held)
+        return _ActiveSet(self.sub.b > 0.0, *(bounds or (self._off, self._off)), held)
 
     def hinge_arguments(self, d: Array) -> Array:
         """Linearised c at nodes 1..K, (K, p)."""
@@ -231,7 +228,8 @@ class _Pieces:
             off = np.where(np.abs(residual) > sub.tolerance, np.sign(residual), 0).astype(np.int64)
             turned = np.where(nu * before < 0.0, -before, before)
             terminal = np.where(held, turned, np.where(before == 0, off, before))
-        return self._with_terminal(point, terminal)
+        hinge = self.hinge_arguments(point.d) > 0.0
+        return _ActiveSet(hinge, *self.bounds_at(point), terminal)
 
     def near(self, point: Point) -> _ActiveSet:
         """Pieces the solution of the interior point lies on, or almost.
@@ -247,22 +245,25 @@ class _Pieces:
         terminal = np.where(beyond > 1.0 - share, 2 * sign, sign)
         if sub.tolerance > 0.0:
             terminal = np.where(-beyond > share, 0, terminal)
-        found = self._with_terminal(point, terminal)
-        if self.bounded:
-            slope = np.matmul(sub.R, point.e[..., None])[..., 0] + sub.r
-            slope += np.matmul(point.adjoint[:, None], sub.B)[:, 0]
-            slope /= max(1.0, float(np.max(np.abs(slope))))
-            size = 1.0 + np.abs(point.e)
-            found.lower = (point.e - sub.lower) / size < slope
-            found.upper = (sub.upper - point.e) / size < -slope
-        return found
+        hinge = self.hinge_arguments(point.d) > 0.0
+        return _ActiveSet(hinge, *self.bounds_near(point), terminal)
 
-    def _with_terminal(self, point: Point, terminal: Array) -> _ActiveSet:
+    def bounds_at(self, point: Point) -> tuple[Array, Array]:
+        """Lower and upper bounds that a Newton point passes (active ones by a hair)."""
+        if not self.bounded:
+            return self._off, self._off
+        return point.e < self.sub.lower, point.e > self.sub.upper
+
+    def bounds_near(self, point: Point) -> tuple[Array, Array]:
+        """Lower and upper bounds that hold the interior point's solution, as in :meth:`near`."""
+        if not self.bounded:
+            return self._off, self._off
         sub = self.sub
-        lower = upper = self._off
-        if self.bounded:
-            lower, upper = point.e < sub.lower, point.e > sub.upper
-        return _ActiveSet(self.hinge_arguments(point.d) > 0.0, lower, upper, terminal)
+        slope = np.matmul(sub.R, point.e[..., None])[..., 0] + sub.r
+        slope += np.matmul(point.adjoint[:, None], sub.B)[:, 0]
+        slope /= max(1.0, float(np.max(np.abs(slope))))
+        size = 1.0 + np.abs(point.e)
+        return (point.e - sub.lower) / size < slope, (sub.upper - point.e) / size < -slope
 
     def objective(self, point: Point) -> float:
         """The objective with bounds as stiff penalties, for comparing points."""
