@@ -82,9 +82,10 @@ class WholeNlp:
         self._guess = stacked(*scenario.initial_guess())
         self.build_seconds = time.perf_counter() - began
 
-    def solve(self) -> dict[str, Any]:
-        """CasADi's own dictionary of results."""
-        return self._solver(x0=self._guess, **self._limits)
+    def solve(self, guess: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, Any]:
+        """CasADi's own dictionary of results, from states and controls or the scenario's guess."""
+        x0 = self._guess if guess is None else stacked(*guess)
+        return self._solver(x0=x0, **self._limits)
 
     def answer(self, found: dict[str, Any]) -> Answer:
         """What `solve` returned, as an answer."""

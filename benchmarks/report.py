@@ -39,11 +39,16 @@ def markdown(tables: dict[str, Table], told: dict[str, Any], notes: list[str]) -
 
 
 def save(
-    folder: Path, tables: dict[str, Table], told: dict[str, Any], text: str, raw: dict[str, Any]
+    folder: Path,
+    tables: dict[str, Table],
+    told: dict[str, Any],
+    text: str,
+    raw: dict[str, Any],
+    name: str = "bench",
 ) -> list[Path]:
-    """Write bench.md and bench.json; returns their paths."""
+    """Write <name>.md and <name>.json; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / "bench.md", folder / "bench.json"]
+    paths = [folder / f"{name}.md", folder / f"{name}.json"]
     paths[0].write_text(text, encoding="utf-8")
     data = {"provenance": told, "tables": tables, **raw}
     paths[1].write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

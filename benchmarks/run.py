@@ -18,13 +18,23 @@ import planners
 import report
 import simulation
 import turns
+import worlds
 
 PARTS = ("planners", "growth", "cold", "simulation")
+#: Minutes; on request.
+LONG_PARTS = ("worlds",)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run")
+    parser.add_argument(
+        "--only",
+        choices=PARTS + LONG_PARTS,
+        nargs="+",
+        default=PARTS,
+        help="parts to run (default: %(default)s)",
+    )
+    parser.add_argument("--seeds", type=int, default=worlds.SEEDS, help="random worlds")
     parser.add_argument("--rounds", type=int, default=turns.ROUNDS, help="plans per contender")
     parser.add_argument(
         "--peers-python",
@@ -36,6 +46,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.rounds < 1:
         parser.error(f"--rounds must be at least 1, not {arguments.rounds}")
+    if arguments.seeds < 1:
+        parser.error(f"--seeds must be at least 1, not {arguments.seeds}")
     began = time.perf_counter()
     tables: dict[str, report.Table] = {}
     notes: list[str] = []
@@ -67,12 +79,20 @@ def main() -> None:
     if "simulation" in arguments.only:
         tables["Environment, features observation"] = simulation.environment_rows()
         tables["Evaluation"] = simulation.evaluation_rows()
+    if "worlds" in arguments.only:
+        found = worlds.measure(arguments.seeds, arguments.folder)
+        tables["Random worlds"] = worlds.rows(found)
+        raw["worlds"] = worlds.raw(found)
+        notes += worlds.notes(found)
+        notes += [f"Figure: {path}" for path in worlds.draw(found, arguments.folder)]
 
     notes += [f"skipped {name}: {why}" for name, why in raw["skipped"].items()]
     told = report.where()
     text = report.markdown(tables, told, notes)
     print(text)
-    written = report.save(arguments.folder, tables, told, text, raw)
+    # Worlds alone leave the tables of the other parts in place.
+    name = "worlds" if set(arguments.only) == {"worlds"} else "bench"
+    written = report.save(arguments.folder, tables, told, text, raw, name)
     print(f"written: {', '.join(map(str, written))} ({time.perf_counter() - began:.0f} s)")
 
 

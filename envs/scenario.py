@@ -274,6 +274,38 @@ class Scenario:
         shape = (*x.shape[:-1], car.STATE_DIM, car.STATE_DIM)
         return array_namespace(x).broadcast_to(_like(x, np.eye(car.STATE_DIM)), shape)
 
+    def parameters(self) -> dict[str, np.ndarray]:
+        """The numbers in the functions above, so that planners compile them once for all."""
+        return {
+            "obstacles": self.obstacles,
+            "clearance": np.asarray(self.clearance),
+            "slip": self.slip,
+            "goal": self.goal,
+        }
+
+    def with_parameters(self, parameters: dict[str, np.ndarray]) -> Scenario:
+        """A scenario with these numbers, which may be symbols: not validated."""
+        copy = object.__new__(Scenario)
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        vars(copy).update({**fields, **parameters})
+        return copy
+
+    def reposed(
+        self, *, start: np.ndarray | None = None, final_time: float | None = None
+    ) -> Scenario:
+        """The same task from another state or with another horizon, for a planner on its way.
+
+        Not validated: a car on its way may be inside an obstacle, which no scenario starts in.
+        """
+        copy = object.__new__(Scenario)
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        if start is not None:
+            fields["start"] = start
+        if final_time is not None:
+            fields["horizon"] = float(final_time)
+        vars(copy).update(fields)
+        return copy
+
     def initial_guess(self) -> tuple[np.ndarray, np.ndarray]:
         """The straight line with its heading and speed: states (N, 5) and zero controls.
 
@@ -290,6 +322,22 @@ class Scenario:
         x[:, 4] = 0.0
         x[0] = self.start
         return x, np.zeros((self.nodes - 1, car.CONTROL_DIM))
+
+    def guesses(self, count: int) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """Up to `count` routes past the obstacles: label, states (N, 5), controls (N−1, 2).
+
+        One for each homotopy class and gear, the most promising first; see
+        :mod:`slipcar.envs.routes`.
+        """
+        from slipcar.envs import routes
+
+        return routes.guesses(self, count)
+
+    def homotopy_class(self, states: np.ndarray) -> tuple[int, ...]:
+        """Winding number of a path (N, 5) about each obstacle, (k,); see `envs.routes`."""
+        from slipcar.envs import routes
+
+        return routes.homotopy_class(self, states)
 
     # ---------------------------------------------------------------- what a path costs
 

@@ -4,17 +4,24 @@
     p = plan(problem)                    # any object that satisfies Problem
     action, _ = OpenLoop(p).predict(observation)
 
-Needs NumPy and SciPy alone; the `osqp` and `cvxpy` backends import their packages when used.
+Needs NumPy and SciPy alone; numba, where installed, makes it some twenty times faster; the `osqp`
+and `cvxpy` backends import their packages when used.
 """
 
+from slipcar.planner.batch import plan_batch
+from slipcar.planner.certificate import Certificate
 from slipcar.planner.controllers import Feedback, OpenLoop
+from slipcar.planner.history import Iteration
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.plan import Plan, plan
+from slipcar.planner.plan import Plan
+from slipcar.planner.planning import plan
 from slipcar.planner.problem import Problem
-from slipcar.planner.scp import Iteration
+from slipcar.planner.records import Alternative, TimeStep
 from slipcar.planner.status import Status
 
 __all__ = [
+    "Alternative",
+    "Certificate",
     "Feedback",
     "Iteration",
     "Multipliers",
@@ -22,5 +29,7 @@ __all__ = [
     "Plan",
     "Problem",
     "Status",
+    "TimeStep",
     "plan",
+    "plan_batch",
 ]

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.planner.control_set import control_ball, control_limits, project_controls
 from slipcar.planner.feedback import default_tracking, lqr_gains, weight_matrix
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem import control_limits
 
 Array = np.ndarray
 
@@ -101,7 +101,7 @@ class OpenLoop:
 
 
 class Feedback(OpenLoop):
-    """u = ū + K (x − μ): a plan with gains, clipped to the control bounds.
+    """u = ū + K (x − μ): a plan with gains, projected onto the admissible controls.
 
     Plans that have `gains` use them. Otherwise they are those of the time-varying LQR around
     the plan, min ∫ δxᵀQδx + δuᵀRδu dt + δx(T)ᵀQf δx(T), with R the problem's control weight.
@@ -138,7 +138,9 @@ class Feedback(OpenLoop):
             raise ValueError(f"gains must be finite and of shape {wanted}, not {gains.shape}")
         super().__init__(plan.replace(gains=gains))
         self._angles = tuple(getattr(plan.problem, "angles", ()))
-        self._bounds = control_limits(getattr(plan.problem, "control_bounds", None), m)
+        bounds = control_limits(getattr(plan.problem, "control_bounds", None), m)
+        radius = control_ball(getattr(plan.problem, "control_radius", None), *bounds)
+        self._admissible = (*bounds, radius)
 
     def control(self, t: Any, x: Any) -> Array:
         """Control in physical units at times t (...,) [s] and states x (..., n): (..., m)."""
@@ -149,7 +151,7 @@ class Feedback(OpenLoop):
         assert self.plan.gains is not None
         # A sum over states rather than a matrix product: the same bits for any batch size.
         correction = (self.plan.gains[k] * error[..., None, :]).sum(axis=-1)
-        return np.clip(self.plan.controls[k] + correction, *self._bounds)
+        return project_controls(self.plan.controls[k] + correction, *self._admissible)
 
     def _numbers(self) -> list[Array]:
         assert self.plan.gains is not None

@@ -5,12 +5,15 @@ With deviations d_k = μ_k − μ̄_k and e_k = u_k − ū_k, K = N − 1 interv
     minimise  Σ_{k=0}^{K-1} ½ e_kᵀ R_k e_k + r_kᵀ e_k
             + Σ_{k=1}^{K}   ½ d_kᵀ Q_k d_k + q_kᵀ d_k + ½ Σ_i h_i max(0, a_kiᵀ d_k + b_ki)²
             + ρ Σ_j max(0, |G d_K + g|_j − τ)
-    s.t.      d_{k+1} = A_k d_k + B_k e_k + f_k,    lower_k ≤ e_k ≤ upper_k
+    s.t.      d_{k+1} = A_k d_k + B_k e_k + f_k,    lower_k ≤ e_k ≤ upper_k,
+              ‖e_k − center_k‖₂ ≤ radius
 
 * f_k is the defect of the iterate: zero once it satisfies the non-linear dynamics.
 * The hinge rows are the convex-composite model of L = w max(0, c)²: c is linearised, the
   square of the positive part is kept (§3.3). The literal scheme linearises L whole: no rows,
   only q.
+* The smooth running costs H(t, x) and ℓ(t, x)ᵀu enter q, r and, with the Hessian of H made
+  positive semidefinite, Q.
 * The variance penalty w ∫ tr Σ enters Q and q through an adjoint sweep (:mod:`.moments`).
 * The trust region enters Q with its multiplier (§3.4).
 * The terminal condition is an exact penalty: satisfied exactly whenever its multiplier stays
@@ -20,9 +23,12 @@ With deviations d_k = μ_k − μ̄_k and e_k = u_k − ū_k, K = N − 1 interv
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
+from slipcar.planner.control_set import project_controls
+from slipcar.planner.integrators import change, jacobian
 from slipcar.planner.moments import Variance
 from slipcar.planner.problem import Model
 
@@ -36,9 +42,9 @@ class Linearization:
     Attributes:
         x: states, (N, n).
         u: controls, (K, m).
-        A: I + dt ∂b/∂x, (K, n, n).
-        B: dt ∂b/∂u, (K, n, m).
-        defect: x_k + dt b(x_k, u_k) − x_{k+1}, (K, n).
+        A: ∂x⁺/∂x of a step of the integrator, I + dt ∂b/∂x for Euler's, (K, n, n).
+        B: ∂x⁺/∂u, dt ∂b/∂u for Euler's, (K, n, m).
+        defect: x⁺(x_k, u_k) − x_{k+1}, (K, n).
         sigma: diffusion at nodes 0..K−1, (K, n, d).
         c: penalty arguments at nodes 1..K, (K, p).
         C: their Jacobians, (K, p, n).
@@ -46,6 +52,10 @@ class Linearization:
         G: its Jacobian, (q, n).
         effort: Σ dt uᵀRu.
         penalty: Σ dt Σ w max(0, c)².
+        running: Σ dt (H + ℓᵀu); 0 where there are no such costs, and the rest is None.
+        q_running: its gradient with respect to nodes 1..K, (K, n), or None.
+        Q_running: dt times the Hessian of H there, positive semidefinite, (K, n, n), or None.
+        r_running: its gradient with respect to the controls, dt ℓ, (K, m), or None.
     """
 
     x: Array
@@ -60,14 +70,19 @@ class Linearization:
     G: Array
     effort: float
     penalty: float
+    running: float = 0.0
+    q_running: Array | None = None
+    Q_running: Array | None = None
+    r_running: Array | None = None
 
     @property
     def finite(self) -> bool:
         """Whether the model functions returned finite numbers everywhere."""
+        costs = (self.running, self.q_running, self.Q_running, self.r_running)
         return all(
             np.isfinite(a).all()
             for a in (self.A, self.B, self.defect, self.sigma, self.c, self.C, self.g, self.G)
-        )
+        ) and all(np.isfinite(a).all() for a in costs if a is not None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +106,8 @@ class Subproblem:
         tolerance: τ ≥ 0; 0 asks for equality.
         lower: (K, m), −inf where unbounded.
         upper: (K, m).
+        center: centres −ū_k of the balls of controls, (K, m).
+        radius: theirs, inf where there are none.
     """
 
     A: Array
@@ -109,6 +126,8 @@ class Subproblem:
     tolerance: float
     lower: Array
     upper: Array
+    center: Array
+    radius: float
 
     def objective(self, d: Array, e: Array) -> float:
         """Value at deviations d (K, n) of nodes 1..K and e (K, m)."""
@@ -137,19 +156,28 @@ class Subproblem:
         """Whether any control bound is finite."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
+    def admissible(self, e: Array) -> Array:
+        """The nearest deviations within bounds and balls, (K, m)."""
+        if self.radius == np.inf:
+            return np.clip(e, self.lower, self.upper) if self.bounded else e
+        low, high = self.lower - self.center, self.upper - self.center
+        return project_controls(e - self.center, low, high, self.radius) + self.center
+
 
 def linearize(model: Model, x: Array, u: Array) -> Linearization:
     """Evaluate the model and its first derivatives along x (N, n), u (N−1, m)."""
     t, dt = model.times, model.dt[:, None]
-    b = model.drift(t[:-1], x[:-1], u)
-    A, B = model.drift_jacobian(t[:-1], x[:-1], u)
+    moved = change(model.integrator, model.drift, t[:-1], model.dt, x[:-1], u)
+    A, B = jacobian(
+        model.integrator, model.drift, model.drift_jacobian, t[:-1], model.dt, x[:-1], u
+    )
     c = model.penalty(t[1:], x[1:])
     return Linearization(
         x=x,
         u=u,
-        A=np.eye(x.shape[1]) + dt[..., None] * A,
-        B=dt[..., None] * B,
-        defect=x[:-1] + dt * b - x[1:],
+        A=A,
+        B=B,
+        defect=x[:-1] + moved - x[1:],
         sigma=np.asarray(model.diffusion(t[:-1], x[:-1])),
         c=c,
         C=np.asarray(model.penalty_jacobian(t[1:], x[1:])),
@@ -157,7 +185,36 @@ def linearize(model: Model, x: Array, u: Array) -> Linearization:
         G=np.asarray(model.terminal_jacobian(x[-1])),
         effort=float(np.vdot(dt * u, u @ model.R)),
         penalty=float(np.vdot(dt * model.weight, np.maximum(c, 0.0) ** 2)),
+        **(_running(model, x, u) if model.state_cost or model.control_cost else {}),
     )
+
+
+def _running(model: Model, x: Array, u: Array) -> dict[str, Any]:
+    """∫ H + ℓᵀu dt and its derivatives: the last four fields of a `Linearization`."""
+    t, dt = model.times, model.dt[:, None]
+    found: dict[str, Any] = {"running": 0.0, "q_running": np.zeros((len(dt), x.shape[1]))}
+    if model.state_cost is not None and model.state_cost_derivatives is not None:
+        found["running"] += float(np.dot(model.dt, model.state_cost(t[1:], x[1:])))
+        gradient, hessian = model.state_cost_derivatives(t[1:], x[1:])
+        found["q_running"] += dt * gradient
+        found["Q_running"] = dt[..., None] * nearest_semidefinite(np.asarray(hessian))
+    if model.control_cost is not None and model.control_cost_jacobian is not None:
+        r = dt * model.control_cost(t[:-1], x[:-1])
+        slope = np.asarray(model.control_cost_jacobian(t[1:-1], x[1:-1]))
+        found["running"] += float(np.vdot(r, u))
+        found["q_running"][:-1] += dt[1:] * np.einsum("kmn,km->kn", slope, u[1:])
+        found["r_running"] = r
+    return found
+
+
+def nearest_semidefinite(H: Array) -> Array:
+    """The nearest positive semidefinite matrices to symmetric ones, (..., n, n)."""
+    if not np.isfinite(H).all():
+        return H  # the caller refuses it
+    values, vectors = np.linalg.eigh(H)
+    if (values >= 0.0).all():
+        return H
+    return (vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2)
 
 
 def convexify(
@@ -192,6 +249,13 @@ def convexify(
         # σ at the last node drives nothing; node 0 is fixed.
         q[:-1] += variance.gradient[1:]
         Q[:-1] += variance.hessian[1:]
+    if at.q_running is not None:
+        q += at.q_running
+    if at.Q_running is not None:
+        Q += at.Q_running
+    r = np.einsum("kij,kj->ki", R, at.u)
+    if at.r_running is not None:
+        r += at.r_running
     h = two_dt[:, None] * model.weight
     if composite:
         a, b = at.C, at.c
@@ -207,7 +271,7 @@ def convexify(
         Q=Q,
         q=q,
         R=R,
-        r=np.einsum("kij,kj->ki", R, at.u),
+        r=r,
         a=a,
         b=b,
         h=h,
@@ -217,4 +281,6 @@ def convexify(
         tolerance=tolerance,
         lower=model.lower - at.u,
         upper=model.upper - at.u,
+        center=-at.u,
+        radius=model.radius,
     )

@@ -1,9 +1,13 @@
 """What `plan` solves: the protocol a problem satisfies, and its checked, completed form.
 
-    minimise  E ∫₀ᵀ [ uᵀRu + Σ_i w_i max(0, c_i(t,x))² ] dt
-    s.t.      dx = b(t,x,u) dt + σ(t,x) dB,   x(0) = start,   E[g(x(T))] = 0,   lower ≤ u ≤ upper
+    minimise  E ∫₀ᵀ [ uᵀRu + H(t,x) + ℓ(t,x)ᵀu + Σ_i w_i max(0, c_i(t,x))² ] dt
+    s.t.      dx = b(t,x,u) dt + σ(t,x) dB,   x(0) = start,   E[g(x(T))] = 0,
+              lower ≤ u ≤ upper,   ‖u‖₂ ≤ radius
 
 b is affine in u; σ may depend only on states that the noise never reaches (paper §6.1).
+Costs of the state are charged at nodes 1..N−1, each with the dt of the interval that ends there,
+those of the control with the dt of its interval; both are taken at the mean, and the noise is
+charged by `variance_weight` in :func:`slipcar.planner.plan`.
 `slipcar.envs.Scenario` satisfies the protocol; the two packages do not know each other.
 """
 
@@ -15,7 +19,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from slipcar.planner.derivatives import complex_step_jacobian
+from slipcar.planner.control_set import control_ball, control_limits, project_controls
+from slipcar.planner.derivatives import complex_step_jacobian, gradient_and_hessian
+from slipcar.planner.integrators import change
+from slipcar.planner.recent import Recent
 
 Array = np.ndarray
 
@@ -31,7 +38,14 @@ class Problem(Protocol):
       `diffusion_jacobian(t, x)` -> (..., n, d, n), `terminal_jacobian(x)` -> (..., q, n) and
       `penalty_jacobian(t, x)` -> (..., p, n).
     * `penalty(t, x)` -> c (..., p) with `penalty_weight` (p,): the cost Σ w max(0, c)².
+    * `state_cost(t, x)` -> H (...,): any twice differentiable running cost. The sub-problem
+      has its gradient and its Hessian, projected to positive semidefinite: nothing changes where
+      H is convex. `state_cost_derivatives(t, x)` -> gradient (..., n), Hessian (..., n, n);
+      otherwise complex-step gradients and their central differences.
+    * `control_cost(t, x)` -> ℓ (..., m): the running cost ℓᵀu, affine in u (L of the paper),
+      linearised as the paper does. `control_cost_jacobian(t, x)` -> (..., m, n).
     * `control_bounds`: None, (m,) for |u| ≤ bound, or (2, m) for lower and upper.
+    * `control_radius`: None, or r > 0 for ‖u‖₂ ≤ r; box and ball may be combined.
     * `initial_guess()` -> states (N, n), controls (N−1, m); otherwise the uncontrolled path
       (or the start at all times, if that path grows without bound).
     * `angles`: state components of period 2π, so that feedback wraps their errors.
@@ -76,6 +90,7 @@ class Model:
         R: control weight, (m, m).
         lower: lower control bounds, (m,), −inf where unbounded.
         upper: upper control bounds, (m,).
+        radius: of the ball of controls, inf where there is none.
         weight: penalty weights, (p,).
         drift: (t, x, u) -> (..., n).
         drift_jacobian: (t, x, u) -> ((..., n, n), (..., n, m)).
@@ -85,6 +100,12 @@ class Model:
         penalty_jacobian: (t, x) -> (..., p, n).
         terminal: x -> (..., q).
         terminal_jacobian: x -> (..., q, n).
+        state_cost: (t, x) -> (...,), or None.
+        state_cost_derivatives: (t, x) -> ((..., n), (..., n, n)), or None.
+        control_cost: (t, x) -> (..., m), or None.
+        control_cost_jacobian: (t, x) -> (..., m, n), or None.
+        own_guess: instead of the problem's `initial_guess`, where the start is another.
+        integrator: of the mean, `"euler"` or `"rk4"`; see :mod:`slipcar.planner.integrators`.
     """
 
     problem: Problem
@@ -94,6 +115,7 @@ class Model:
     R: Array
     lower: Array
     upper: Array
+    radius: float
     weight: Array
     drift: Callable[[Array, Array, Array], Array]
     drift_jacobian: Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -103,6 +125,12 @@ class Model:
     penalty_jacobian: Callable[[Array, Array], Array]
     terminal: Callable[[Array], Array]
     terminal_jacobian: Callable[[Array], Array]
+    state_cost: Callable[[Array, Array], Array] | None = None
+    state_cost_derivatives: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    control_cost: Callable[[Array, Array], Array] | None = None
+    control_cost_jacobian: Callable[[Array, Array], Array] | None = None
+    integrator: str = "euler"
+    own_guess: Callable[[], tuple[Array, Array]] | None = None
 
     @property
     def state_dim(self) -> int:
@@ -119,26 +147,37 @@ class Model:
         """Whether any control bound is finite."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
+    def admissible(self, u: Array) -> Array:
+        """The nearest controls within bounds and ball, (..., m)."""
+        return project_controls(u, self.lower, self.upper, self.radius)
+
     def guess(self) -> tuple[Array, Array]:
         """The problem's own, else the uncontrolled path, else (it escapes) resting at the start."""
         N, n, m = len(self.times), self.state_dim, self.control_dim
-        own = getattr(self.problem, "initial_guess", None)
+        own = self.own_guess or getattr(self.problem, "initial_guess", None)
         if own is not None:
             x, u = own()
         else:
-            u = np.clip(np.zeros((N - 1, m)), self.lower, self.upper)
+            u = self.admissible(np.zeros((N - 1, m)))
             x = np.empty((N, n))
             x[0] = self.start
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 for k in range(N - 1):
-                    x[k + 1] = x[k] + self.dt[k] * self.drift(self.times[k], x[k], u[k])
+                    t, dt = self.times[k], self.dt[k]
+                    moved = change(self.integrator, self.drift, t, dt, x[k], u[k])
+                    if np.shape(moved) != (n,):
+                        raise ValueError(
+                            f"drift(t, x, u) must have shape ({n},) for one point, not "
+                            f"{np.shape(moved)}"
+                        )
+                    x[k + 1] = x[k] + moved
             if not np.isfinite(x).all():
                 x[:] = self.start
         return checked_trajectory(self, x, u)
 
 
 def checked_trajectory(model: Model, x: Any, u: Any) -> tuple[Array, Array]:
-    """States (N, n) starting at `start` and controls (N−1, m) within bounds, as float64.
+    """States (N, n) starting at `start` and admissible controls (N−1, m), as float64.
 
     Raises:
         ValueError: for a wrong shape or a non-finite entry.
@@ -147,16 +186,30 @@ def checked_trajectory(model: Model, x: Any, u: Any) -> tuple[Array, Array]:
     x = _finite("guess: states", x, (N, model.state_dim)).copy()
     u = _finite("guess: controls", u, (N - 1, model.control_dim))
     x[0] = model.start
-    return x, np.clip(u, model.lower, model.upper)
+    return x, model.admissible(u)
+
+
+_MODELS = Recent()
 
 
 def model_of(problem: Problem) -> Model:
     """Check a problem at the boundary and complete it with complex-step Jacobians.
 
+    For an immutable problem (a frozen dataclass of immutable values) that was seen lately this
+    is the same model as then.
+
     Raises:
         TypeError: if a required member is missing, naming it.
         ValueError: if a shape, value or function result is wrong, naming it.
     """
+    model = _MODELS.get(problem)
+    if model is None:
+        model = _checked(problem)
+        _MODELS.keep(problem, model)
+    return model
+
+
+def _checked(problem: Problem) -> Model:
     required = ("start", "times", "control_weight", "drift", "diffusion", "terminal")
     missing = [name for name in required if not hasattr(problem, name)]
     if getattr(problem, "penalty", None) is not None and not hasattr(problem, "penalty_weight"):
@@ -173,6 +226,7 @@ def model_of(problem: Problem) -> Model:
     if R.shape[0] != R.shape[1] or not np.allclose(R, R.T) or np.linalg.eigvalsh(R)[0] <= 0:
         raise ValueError(f"control_weight must be symmetric positive definite, not {R!r}")
     lower, upper = control_limits(getattr(problem, "control_bounds", None), len(R))
+    radius = control_ball(getattr(problem, "control_radius", None), lower, upper)
     n, m = len(start), len(R)
 
     t2, x2, u2 = times[:2], np.stack([start, start]), np.zeros((2, m))
@@ -216,6 +270,7 @@ def model_of(problem: Problem) -> Model:
         R=R,
         lower=lower,
         upper=upper,
+        radius=radius,
         weight=weight,
         drift=problem.drift,
         drift_jacobian=drift_jacobian,
@@ -225,7 +280,33 @@ def model_of(problem: Problem) -> Model:
         penalty_jacobian=penalty_jacobian,
         terminal=problem.terminal,
         terminal_jacobian=terminal_jacobian,
+        **_running_costs(problem, t2, x2, m),
     )
+
+
+def _running_costs(problem: Problem, t2: Array, x2: Array, m: int) -> dict[str, Any]:
+    """State and control cost with their derivatives, checked at two points (2,), (2, n)."""
+    n = x2.shape[1]
+    H, linear = getattr(problem, "state_cost", None), getattr(problem, "control_cost", None)
+    found: dict[str, Any] = {}
+    if H is not None:
+        _finite("state_cost(t, x) at the start", H(t2, x2), (2,))
+        derivatives = getattr(problem, "state_cost_derivatives", None)
+        if derivatives is None:
+
+            def derivatives(t: Array, x: Array) -> tuple[Array, Array]:
+                return gradient_and_hessian(lambda y: H(t, y), x)
+
+        gradient, hessian = derivatives(t2, x2)
+        _finite("state_cost_derivatives(t, x)[0]", gradient, (2, n))
+        _finite("state_cost_derivatives(t, x)[1]", hessian, (2, n, n))
+        found |= {"state_cost": H, "state_cost_derivatives": derivatives}
+    if linear is not None:
+        _finite("control_cost(t, x) at the start", linear(t2, x2), (2, m))
+        jacobian = getattr(problem, "control_cost_jacobian", None) or _state_jacobian(linear)
+        _finite("control_cost_jacobian(t, x)", jacobian(t2, x2), (2, m, n))
+        found |= {"control_cost": linear, "control_cost_jacobian": jacobian}
+    return found
 
 
 def _finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
@@ -242,28 +323,6 @@ def _finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name}{list(index)} must be finite, not {array[index]}")
     return array
-
-
-def control_limits(given: Any, m: int) -> tuple[Array, Array]:
-    """Lower and upper bounds, each (m,), from what `Problem.control_bounds` may be.
-
-    Raises:
-        ValueError: for another shape, NaN, or lower ≥ upper.
-    """
-    if given is None:
-        return np.full(m, -np.inf), np.full(m, np.inf)
-    try:
-        bounds = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        bounds = np.full(0, np.nan)
-    if bounds.shape == (m,):
-        bounds = np.stack([-bounds, bounds])
-    if bounds.shape != (2, m) or np.isnan(bounds).any() or not (bounds[0] < bounds[1]).all():
-        raise ValueError(
-            f"control_bounds must be None, ({m},) positive bounds on |u|, or (2, {m}) lower < "
-            f"upper, not {given!r}"
-        )
-    return bounds[0], bounds[1]
 
 
 def _no_penalty(t: Array, x: Array) -> Array:

@@ -15,6 +15,8 @@ from typing import Protocol
 _MERIT_NOISE = 1e-8
 #: Beyond this a step is as short as it can be, and rounding errors take over.
 _LARGEST_MULTIPLIER = 1e8
+#: A multiplier is dropped when its penalty is so small a part of what the step promised.
+_NEGLIGIBLE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,13 +44,25 @@ class TrustRegion(Protocol):
     Attributes:
         limits_radius: whether `fits` looks at the radius, which must then be measured in full
             even while the multiplier is zero.
+        bold: whether the next step may be long and is not judged; control bounds may then wait.
+        accelerates: whether steps may be lengthened or combined where they converge slowly.
     """
 
     limits_radius: bool
+    accelerates: bool
+
+    @property
+    def bold(self) -> bool:
+        """Whether the next step may be long and is not judged."""
+        ...
 
     @property
     def multiplier(self) -> float:
         """Weight to solve the next sub-problem with."""
+        ...
+
+    def cautious(self, multiplier: float) -> TrustRegion | None:
+        """A fresh schedule for a second attempt whose steps are short from the first, if any."""
         ...
 
     def fits(self, radius: float) -> bool:
@@ -70,6 +84,8 @@ class NoTrustRegion:
 
     limits_radius = False
     multiplier = 0.0
+    bold = False  # the control bounds are to act from the first step
+    accelerates = False
 
     @property
     def collapsed(self) -> bool:
@@ -78,6 +94,9 @@ class NoTrustRegion:
 
     def __init__(self) -> None:
         self._refused = False
+
+    def cautious(self, multiplier: float) -> None:
+        """There is no such schedule."""
 
     def fits(self, radius: float) -> bool:
         """Always."""
@@ -97,6 +116,8 @@ class PaperTrustRegion:
     """
 
     limits_radius = True
+    bold = False
+    accelerates = False
 
     def __init__(self, radius: float = 100.0, shrink: float = 0.99) -> None:
         self.radius, self.shrink = radius, shrink
@@ -108,6 +129,9 @@ class PaperTrustRegion:
     def collapsed(self) -> bool:
         """Whether a step was refused: the schedule is fixed and knows no shorter one."""
         return self._refused
+
+    def cautious(self, multiplier: float) -> None:
+        """There is no such schedule."""
 
     def fits(self, radius: float) -> bool:
         """Whether the step keeps Δ (to 1 %, from inside); moves the multiplier if not.
@@ -148,11 +172,21 @@ class AdaptiveTrustRegion:
     """
 
     limits_radius = False
+    accelerates = True
 
-    def __init__(self, free: int = 25, patience: int = 30) -> None:
-        self.multiplier = 0.0
-        self._free, self._patience = free, patience
+    def __init__(self, free: int = 25, patience: int = 30, multiplier: float = 0.0) -> None:
+        self.multiplier = multiplier
+        self._free, self._patience, self._was_free = free, patience, free > 0
         self._rejected = 0
+
+    @property
+    def bold(self) -> bool:
+        """Whether free steps are left, but for a few that are taken within bounds."""
+        return self._free > 10
+
+    def cautious(self, multiplier: float) -> AdaptiveTrustRegion | None:
+        """Every step judged, the first with this multiplier; None if these already were."""
+        return AdaptiveTrustRegion(0, self._patience, multiplier) if self._was_free else None
 
     def fits(self, radius: float) -> bool:
         """Always: the multiplier already shaped the step."""
@@ -179,6 +213,8 @@ class AdaptiveTrustRegion:
         self._rejected = 0
         if ratio > 0.7:
             self.multiplier /= 4.0
+            if self.multiplier < _NEGLIGIBLE * natural:
+                self.multiplier = 0.0
         elif ratio < 0.3:
             self.multiplier *= 2.0
         return True

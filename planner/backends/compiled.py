@@ -17,6 +17,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from slipcar.planner.backends.compiled_ball import add_spheres, move_spheres
+
 Array = np.ndarray
 
 _STEP_PRECISION, _WHOLE_STEPS = 1e-3, 10  # as in structured.py
@@ -271,12 +273,13 @@ def _line_search(Q, q, R, r, h, lower, upper, stiffness, c, d, e, c_to, d_to, e_
 @numba.njit(cache=True, fastmath=False)
 def newton(
     A, B, f, Q, q, R, r, a, b, h, G, g, rho, tolerance, lower, upper,
-    stiffness, softness, hinge, low, high, terminal, limit,
+    stiffness, softness, hinge, low, high, terminal,
+    center, radius, kappa, settled, sphere, turn, press, limit,
 ):  # fmt: skip
     """Active-set Newton from the set (hinge, low, high, terminal); see `structured._newton`.
 
-    Arrays are those of :class:`slipcar.planner.convexify.Subproblem`; the active set is
-    changed in place.
+    Arrays are those of :class:`slipcar.planner.convexify.Subproblem`; the active set and, with
+    balls, the spheres (on: sphere, turn, press) of :mod:`.ball` are changed in place.
 
     Returns:
         Whether it settled, LQ solves, d, e, adjoint, terminal multiplier.
@@ -289,6 +292,7 @@ def newton(
     c, c_to = np.empty((K, p)), np.empty((K, p))
     held, right = np.empty(t, dtype=np.bool_), np.empty(t)
     value = np.inf
+    balls = radius < np.inf
     for solves in range(1, limit + 1):
         # The LQ problem of the active set.
         Qa, qa, Ra, ra = Q.copy(), q.copy(), R.copy(), r.copy()
@@ -309,6 +313,8 @@ def newton(
                 elif low[k, i]:
                     Ra[k, i, i] += stiffness
                     ra[k, i] -= stiffness * lower[k, i]
+        if balls:
+            add_spheres(Ra, ra, center, radius, kappa, sphere, turn, press)
         for j in range(t):
             held[j] = abs(terminal[j]) == 1
             if held[j]:
@@ -322,7 +328,7 @@ def newton(
         _arguments(a, b, d_to, c_to)
         target_value = _objective(Q, q, R, r, h, lower, upper, stiffness, c_to, d_to, e_to)
         step = 1.0
-        if solves > _WHOLE_STEPS and target_value > value:
+        if solves > _WHOLE_STEPS and target_value > value and not balls:
             step = _line_search(Q, q, R, r, h, lower, upper, stiffness, c, d, e, c_to, d_to, e_to)
         if solves == 1 or step > 1.0 - 1e-10:
             step, value = 1.0, target_value
@@ -345,6 +351,8 @@ def newton(
                 below, above = e[k, i] < lower[k, i], e[k, i] > upper[k, i]
                 same = same and below == low[k, i] and above == high[k, i]
                 low[k, i], high[k, i] = below, above
+        if balls and not move_spheres(e, R, center, radius, kappa, settled, sphere, turn, press):
+            same = False
         if tolerance > 0.0:
             for j in range(t):
                 old = terminal[j]

@@ -64,6 +64,8 @@ class CvxpySolver:
             finite = np.isfinite(bound)
             if finite.any():
                 constraints.append(sign * flat_e[finite.ravel()] <= bound[finite])
+        if np.isfinite(sub.radius):
+            constraints.append(cp.norm(e - sub.center, 2, axis=1) <= sub.radius)
 
         problem = cp.Problem(cp.Minimize(cost), constraints)
         try:

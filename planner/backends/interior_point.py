@@ -5,6 +5,7 @@ terminal condition that cannot be met. Every inequality s ≥ 0 has a multiplier
 s z = μ → 0; linearised and eliminated, each only adds to the LQ problem's diagonal:
 
 * bounds: R gets z/s, r the rest;
+* balls, in the form s + (‖u‖² − r²)/(2r) = 0: R gets (z/s) t tᵀ + (z/r) I with t = u/r;
 * hinges ½ h t², t ≥ c, t ≥ 0: a weight on their row;
 * the terminal slacks of the exact penalty and the box round the condition: softness δ of its
   row, G d − δ ν = s.
@@ -27,13 +28,15 @@ Array = np.ndarray
 
 _MAX_STEPS = 100
 _GAP = 1e-9
+#: What is good enough to be polished when so many steps have brought nothing better.
+_ENOUGH, _IDLE = 1e-6, 8
 
 
 @dataclasses.dataclass
 class _Pairs:
     """Slacks and multipliers of every inequality.
 
-    Bounds on e are (K, m), hinges (K, p), the rest (q,).
+    Bounds on e are (K, m), hinges (K, p), balls (K,), the rest (q,).
     """
 
     lower: Array
@@ -52,6 +55,8 @@ class _Pairs:
     z_high: Array
     low: Array  # τ + w
     z_low: Array
+    ball: Array  # (K,), or (0,) where there are no balls
+    z_ball: Array
 
     def couples(self) -> list[tuple[Array, Array]]:
         f = [getattr(self, field.name) for field in dataclasses.fields(self)]
@@ -68,12 +73,21 @@ class _Pairs:
         return _Pairs(*(a + step * b for a, b in zip(ours, theirs, strict=True)))
 
 
-def interior_point(sub: Subproblem, kkt: BandedKkt) -> tuple[Point | None, int]:
-    """Solve the sub-problem loaded in `kkt`; the point (None if it fails) and the LQ solves."""
+def interior_point(sub: Subproblem, kkt: BandedKkt) -> tuple[Point | None, Array, int]:
+    """Solve the sub-problem loaded in `kkt`.
+
+    Returns:
+        The point (None if it fails), multipliers of the balls (K,) or (0,), LQ solves.
+    """
     K, n = sub.f.shape
-    q, boxed = len(sub.g), sub.tolerance > 0.0
+    q, boxed, balls = len(sub.g), sub.tolerance > 0.0, sub.radius < np.inf
     # A strictly feasible start: controls inside their bounds, states by the dynamics.
     e = _inside(sub.lower, sub.upper)
+    if balls:
+        u = e - sub.center
+        within = 0.5 * sub.radius / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300)
+        shrunk = np.minimum(within, 1.0) * u + sub.center
+        e = shrunk if ((sub.lower < shrunk) & (shrunk < sub.upper)).all() else e
     d = sub.response(e)
     point = Point(d, e, np.zeros((K, n)), np.zeros(q))
     c = np.matmul(sub.a, d[..., None])[..., 0] + sub.b
@@ -101,13 +115,16 @@ def interior_point(sub: Subproblem, kkt: BandedKkt) -> tuple[Point | None, int]:
             z_high=np.ones(q) if boxed else none,
             low=box,
             z_low=np.ones(q) if boxed else none,
+            ball=np.maximum(-_passed(sub, e), 0.1 * sub.radius) if balls else np.zeros(0),
+            z_ball=np.ones(K if balls else 0),
         )
     w, sigma = np.zeros(q), 0.5
+    best = (np.inf, 0, point, pairs.z_ball)
     scale = max(1.0, float(np.max(np.abs(sub.r))), sub.rho * 1e-3)
     for steps in range(1, _MAX_STEPS + 1):
         found = _direction(sub, kkt, point, pairs, w, sigma * pairs.gap())
         if found is None:
-            return None, steps
+            break
         target, change, dw = found
         step = min(1.0, 0.99 * _longest(pairs, change))
         sigma = min(0.5, max(0.02, (1.0 - step) ** 2))
@@ -116,15 +133,29 @@ def interior_point(sub: Subproblem, kkt: BandedKkt) -> tuple[Point | None, int]:
         w = w + step * dw
         missing = np.abs(sub.G @ point.d[-1] + sub.g - w - pairs.plus + pairs.minus) / size
         size_of_cost = max(scale, abs(sub.objective(point.d, point.e)))
-        if pairs.gap() < _GAP * size_of_cost and np.max(missing, initial=0.0) < _GAP:
-            return point, steps
-    return None, _MAX_STEPS
+        if balls:
+            off = np.abs(pairs.ball + _passed(sub, point.e)) / sub.radius
+            missing = np.concatenate([missing, off])
+        off_by = max(pairs.gap() / size_of_cost, float(np.max(missing, initial=0.0)))
+        if off_by < _GAP:
+            return point, pairs.z_ball, steps
+        if off_by < 0.5 * best[0]:
+            best = (off_by, steps, point, pairs.z_ball)
+        elif best[0] < _ENOUGH and steps > best[1] + _IDLE:
+            break  # rounding errors have taken over
+    return (best[2] if best[0] < _ENOUGH else None), best[3], steps
 
 
 def _inside(lower: Array, upper: Array) -> Array:
     """Zero where it lies well inside the bounds, else a tenth of the way in."""
     width = np.where(np.isfinite(upper - lower), 0.1 * (upper - lower), 1.0)
     return np.clip(0.0, lower + width, upper - width)
+
+
+def _passed(sub: Subproblem, e: Array) -> Array:
+    """(‖u‖² − r²)/(2r) ≤ 0 for the balls, (K,)."""
+    u = e - sub.center
+    return 0.5 * (np.sum(u * u, axis=1) / sub.radius - sub.radius)
 
 
 def _longest(pairs: _Pairs, change: _Pairs) -> float:
@@ -161,7 +192,17 @@ def _direction(
         lean = (mu / p.low - mu / p.high) / W
         soft, right = soft + 1.0 / W, right + w + lean
     held = np.ones(len(sub.g), dtype=bool)
-    target = kkt.solve(omega, force, held, -soft, right, (over_l + over_u, push))
+    block = (over_l + over_u)[..., None] * np.eye(push.shape[1])
+    ray, balls = None, len(p.ball) > 0
+    if balls:
+        u = point.e - sub.center
+        turn, over_b = u / sub.radius, p.z_ball / p.ball
+        off = p.ball + _passed(sub, point.e)
+        ray = turn, over_b, np.sum(turn * point.e, axis=1) - off
+        curvature = p.z_ball / sub.radius
+        block = block + curvature[:, None, None] * np.eye(push.shape[1])
+        push = push + (mu / p.ball)[:, None] * turn - curvature[:, None] * point.e
+    target = kkt.solve(omega, force, held, -soft, right, (block, push), ray)
     if target is None:
         return None
     de = target.e - point.e
@@ -179,6 +220,7 @@ def _direction(
         np.where(above, residual + p.minus + dminus - p.plus, dplus),
         np.where(above, dminus, p.plus + dplus - residual - p.minus),
     )
+    dball = -off - np.sum(turn * de, axis=1) if balls else p.ball
     change = _Pairs(
         lower=np.where(np.isfinite(p.lower), de, 0.0),
         z_lower=mu / p.lower - over_l * de - p.z_lower,
@@ -196,5 +238,7 @@ def _direction(
         z_high=mu / p.high + p.z_high / p.high * dw - p.z_high,
         low=np.where(np.isfinite(p.low), dw, 0.0),
         z_low=mu / p.low - p.z_low / p.low * dw - p.z_low,
+        ball=dball,
+        z_ball=mu / p.ball - over_b * dball - p.z_ball if balls else p.z_ball,
     )
     return target, change, dw

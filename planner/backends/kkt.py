@@ -106,6 +106,7 @@ class BandedKkt:
         nu_diagonal: Array,
         nu_right: Array,
         control: tuple[Array, Array] | None = None,
+        ray: tuple[Array, Array, Array] | None = None,
     ) -> Point | None:
         """The LQ problem's solution, or None if the matrix is singular or overflows.
 
@@ -116,7 +117,8 @@ class BandedKkt:
                 δ_j ν_j = s_j.
             nu_diagonal: −δ for held rows, δ for others, (q,).
             nu_right: s, (q,).
-            control: diagonal added to R and vector added to r, each (K, m).
+            control: blocks added to R, (K, m, m), and vectors added to r, (K, m).
+            ray: t (K, m), a (K,) and s (K,): adds ½ a (tᵀe − s)², however stiff.
         """
         K, n, _ = self.shape
         sub = self._sub
@@ -125,11 +127,18 @@ class BandedKkt:
         flat = band.reshape(-1)
         r, R_inverse, gain = sub.r, self._R_inverse, self._gain
         if control is not None:
-            R = sub.R.copy()
-            diagonal = np.einsum("kii->ki", R)
-            diagonal += control[0]
+            R_inverse = np.linalg.inv(sub.R + control[0])
             r = r + control[1]
-            R_inverse = np.linalg.inv(R)
+        offset: Array = np.zeros(1)
+        if ray is not None:
+            # By Sherman and Morrison's formula, and the pull towards s apart: summed up first,
+            # a stiff ray would drown the rest in rounding errors.
+            t, a, s = ray
+            y = np.matmul(R_inverse, t[..., None])[..., 0]
+            share = a / (1.0 + a * np.sum(t * y, axis=1))
+            R_inverse = R_inverse - share[:, None, None] * y[:, :, None] * y[:, None, :]
+            offset = (share * s)[:, None] * y
+        if control is not None or ray is not None:
             gain = sub.B @ R_inverse
             flat[self._at_S] = -(gain @ sub.B.swapaxes(1, 2))
         flat[self._at_Q] = sub.Q + self._rows @ (weight[..., None] * sub.a)
@@ -139,6 +148,8 @@ class BandedKkt:
         right = np.empty((self.size, 1))
         blocks = right[: 2 * n * K, 0].reshape(K, 2, n)
         np.subtract((gain @ r[..., None])[..., 0], sub.f, out=blocks[:, 0])
+        if ray is not None:
+            blocks[:, 0] -= (sub.B @ offset[..., None])[..., 0]
         np.negative(linear, out=blocks[:, 1])
         right[2 * n * K :, 0] = nu_right
         w = self.width
@@ -150,5 +161,5 @@ class BandedKkt:
         blocks = solution[: 2 * n * K, 0].reshape(K, 2, n)
         adjoint, d = blocks[:, 0], blocks[:, 1]
         force = r + (adjoint[:, None] @ sub.B)[:, 0]
-        e = -(R_inverse @ force[..., None])[..., 0]
+        e = offset - (R_inverse @ force[..., None])[..., 0]
         return Point(d, e, adjoint, solution[2 * n * K :, 0])

@@ -44,7 +44,13 @@ class OsqpSolver:
         self._workspace: osqp.OSQP | None = None
 
     def solve(self, sub: Subproblem) -> Solution:
-        """Solve one sub-problem, from the last one's solution."""
+        """Solve one sub-problem, from the last one's solution.
+
+        Raises:
+            ValueError: if the controls lie in a ball: that is no quadratic program.
+        """
+        if np.isfinite(sub.radius):
+            raise ValueError("osqp cannot take control_radius; use structured or cvxpy")
         shape = (*sub.f.shape, sub.r.shape[1], sub.b.shape[1], len(sub.g))
         if self._pattern is None or self._pattern.shape != shape:
             self._pattern, self._workspace = _Pattern(*shape), None

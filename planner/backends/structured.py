@@ -18,7 +18,7 @@ from types import ModuleType
 
 import numpy as np
 
-from slipcar.planner.backends import Solution, failed
+from slipcar.planner.backends import Solution, ball, failed
 from slipcar.planner.backends.interior_point import interior_point
 from slipcar.planner.backends.kkt import BandedKkt, Point
 from slipcar.planner.convexify import Subproblem
@@ -47,16 +47,22 @@ class _ActiveSet:
     lower: Array  # (K, m) bool
     upper: Array  # (K, m) bool
     terminal: Array  # (q,) signed: 0 inside the box, ±1 held at its side, ±2 multiplier at ±ρ
+    spheres: ball.Spheres | None = None  # of the balls of controls, if there are any
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ActiveSet) and all(
-            a is b or bool((a == b).all())
-            for a, b in (
-                (self.hinge, other.hinge),
-                (self.terminal, other.terminal),
-                (self.lower, other.lower),
-                (self.upper, other.upper),
+        if not isinstance(other, _ActiveSet):
+            return False
+        return (
+            all(
+                a is b or bool((a == b).all())
+                for a, b in (
+                    (self.hinge, other.hinge),
+                    (self.terminal, other.terminal),
+                    (self.lower, other.lower),
+                    (self.upper, other.upper),
+                )
             )
+            and self.spheres == other.spheres
         )
 
 
@@ -73,7 +79,7 @@ class StructuredSolver:
 
     def __init__(self, compiled: bool | None = None) -> None:
         self._kkt: BandedKkt | None = None
-        self._bounds: tuple[Array, Array] | None = None
+        self._bounds: tuple[Array, Array, ball.Spheres | None] | None = None
         self._compiled: ModuleType | None = None
         if compiled is not False:
             try:
@@ -89,16 +95,17 @@ class StructuredSolver:
             self._kkt, self._bounds = BandedKkt(*shape), None
         kkt, pieces = self._kkt, _Pieces(sub)
         active = pieces.start(self._bounds)
-        point, solves = self._newton(pieces, active, _SOLVES + len(sub.f) // _NODES)
+        point, spheres, solves = self._newton(pieces, active, _SOLVES + len(sub.f) // _NODES)
         interior = point is None or np.max(np.abs(point.terminal), initial=0.0) > sub.rho
         if point is None or interior:
             kkt.load(sub)
-            inner, more = interior_point(sub, kkt)
+            inner, press, more = interior_point(sub, kkt)
             solves += more
             if inner is None:
                 self._bounds = None
                 return failed(sub, solves, f"not solved after {solves} LQ solves")
-            point, more = self._newton(pieces, pieces.near(inner), _POLISHING_SOLVES)
+            near = pieces.near(inner, press)
+            point, spheres, more = self._newton(pieces, near, _POLISHING_SOLVES)
             solves += more
             # The last interior systems are ill-conditioned: judge what the controls really do.
             inner = pieces.replayed(inner)
@@ -106,9 +113,10 @@ class StructuredSolver:
             if point is not None:
                 point = pieces.replayed(point)
             if point is None or pieces.objective_of(point) > best + 1e-9 * (1.0 + abs(best)):
-                point = inner
-        self._bounds = pieces.bounds_near(point) if interior else pieces.bounds_at(point)
-        e = np.clip(point.e, sub.lower, sub.upper) if pieces.bounded else point.e
+                point, spheres = inner, near.spheres
+        bounds = pieces.bounds_near(point, spheres) if interior else pieces.bounds_at(point)
+        self._bounds = (*bounds, spheres)
+        e = sub.admissible(point.e)
         return Solution(
             found=True,
             d=point.d,
@@ -119,7 +127,9 @@ class StructuredSolver:
             iterations=solves,
         )
 
-    def _newton(self, pieces: _Pieces, active: _ActiveSet, limit: int) -> tuple[Point | None, int]:
+    def _newton(
+        self, pieces: _Pieces, active: _ActiveSet, limit: int
+    ) -> tuple[Point | None, ball.Spheres | None, int]:
         """:func:`_newton`, compiled or not."""
         if self._compiled is None:
             assert self._kkt is not None
@@ -127,6 +137,7 @@ class StructuredSolver:
             return _newton(self._kkt, pieces, active, limit)
         sub = pieces.sub
         arrays = (sub.A, sub.B, sub.f, sub.Q, sub.q, sub.R, sub.r, sub.a, sub.b, sub.h, sub.G)
+        held = active.spheres or pieces.no_spheres
         settled, solves, *parts = self._compiled.newton(
             *(np.ascontiguousarray(array) for array in arrays),
             sub.g,
@@ -140,25 +151,34 @@ class StructuredSolver:
             active.lower.copy(),
             active.upper.copy(),
             active.terminal.copy(),
+            sub.center,
+            sub.radius,
+            ball.STIFFNESS * pieces.stiffest,
+            ball.SETTLED,
+            held.on,
+            held.turn,
+            held.press,
             limit,
         )
-        return (Point(*parts) if settled else None), solves
+        point = Point(*parts) if settled else None
+        return point, (held if pieces.balls else None), solves
 
 
 def _newton(
     kkt: BandedKkt, pieces: _Pieces, active: _ActiveSet, limit: int
-) -> tuple[Point | None, int]:
-    """The point that lies on the pieces it was computed with, if found; and the solves taken."""
+) -> tuple[Point | None, ball.Spheres | None, int]:
+    """The point that lies on the pieces it was computed with, if found; its spheres; the solves."""
     point: Point | None = None
     value: float | None = None  # of the point; found only when a line search may be needed
     for solves in range(1, limit + 1):
         target = kkt.solve(*pieces.lq(active))
         if target is None:
-            return None, solves
-        found = pieces.active_set(target, active.terminal)
+            return None, None, solves
+        found = pieces.active_set(target, active)
         if found == active:
-            return target, solves
-        if point is None or solves <= _WHOLE_STEPS:
+            return target, found.spheres, solves
+        # (Across a sphere the objective with its stiffness would let no step pass.)
+        if point is None or solves <= _WHOLE_STEPS or pieces.balls:
             point = target
         else:
             if value is None:
@@ -170,9 +190,9 @@ def _newton(
             else:
                 point = point.towards(target, step)
                 value = pieces.objective(point)
-                found = pieces.active_set(point, active.terminal)
+                found = pieces.active_set(point, active)
         active = found
-    return None, limit
+    return None, None, limit
 
 
 class _Pieces:
@@ -182,23 +202,34 @@ class _Pieces:
         self.sub = sub
         self.bounded = sub.bounded
         self._off = np.zeros(sub.r.shape, dtype=bool)
-        self.stiffness = float(np.einsum("kii->ki", sub.R).max()) / _BOUND_WIDTH
+        self.balls = sub.radius < np.inf
+        self.stiffest = float(np.einsum("kii->ki", sub.R).max())
+        self.stiffness = self.stiffest / _BOUND_WIDTH
         # Keeps the matrix regular where the linearised dynamics cannot reach a direction: the
         # multiplier then comes out beyond ρ.
         self.softness = (
             _TERMINAL_WIDTH * max(1.0, float(np.max(np.abs(sub.g), initial=0.0))) / sub.rho
         )
 
-    def start(self, bounds: tuple[Array, Array] | None) -> _ActiveSet:
+    @property
+    def no_spheres(self) -> ball.Spheres:
+        """What the compiled method is given where there are no balls."""
+        return ball.Spheres(np.zeros(0, dtype=bool), self.sub.center[:0], np.zeros(0), 0.0)
+
+    def start(self, before: tuple[Array, Array, ball.Spheres | None] | None) -> _ActiveSet:
         """The hinges on at the iterate, the bounds of the last solution, the condition held."""
         held = np.ones(len(self.sub.g), dtype=np.int64)
-        return _ActiveSet(self.sub.b > 0.0, *(bounds or (self._off, self._off)), held)
+        lower, upper, spheres = before or (self._off, self._off, None)
+        if not self.bounded:
+            lower, upper = self._off, self._off
+        spheres = ball.start(self.sub, spheres) if self.balls else None
+        return _ActiveSet(self.sub.b > 0.0, lower, upper, held, spheres)
 
     def hinge_arguments(self, d: Array) -> Array:
         """Linearised c at nodes 1..K, (K, p)."""
         return np.matmul(self.sub.a, d[..., None])[..., 0] + self.sub.b
 
-    def lq(self, active: _ActiveSet) -> tuple[Array, Array, Array, Array, Array, tuple | None]:
+    def lq(self, active: _ActiveSet) -> tuple:
         """What the LQ problem of an active set adds; arguments of `BandedKkt.solve`."""
         sub = self.sub
         weight = sub.h * active.hinge
@@ -212,11 +243,18 @@ class _Pieces:
             if at_bound.any():
                 stiff = self.stiffness * at_bound
                 bound = np.where(active.upper, sub.upper, np.where(active.lower, sub.lower, 0.0))
-                control = (stiff, -stiff * bound)
-        return weight, weight * sub.b, held, diagonal, right, control
+                control = (stiff[..., None] * np.eye(stiff.shape[1]), -stiff * bound)
+        ray = None
+        if active.spheres is not None and active.spheres.on.any():
+            block, force, ray = ball.terms(sub, active.spheres)
+            control = (
+                (block, force) if control is None else (control[0] + block, control[1] + force)
+            )
+        return weight, weight * sub.b, held, diagonal, right, control, ray
 
-    def active_set(self, point: Point, before: Array) -> _ActiveSet:
-        """Pieces a Newton point lies on; `before` are the terminal pieces it was computed with."""
+    def active_set(self, point: Point, computed_with: _ActiveSet) -> _ActiveSet:
+        """Pieces a Newton point lies on, and those it was computed with."""
+        before = computed_with.terminal
         sub, nu = self.sub, point.terminal
         # What is held shows no residual; its multiplier tells where it wants to go. (A held
         # condition is clipped only by the interior point: doing it here, while the hinges are
@@ -229,10 +267,13 @@ class _Pieces:
             turned = np.where(nu * before < 0.0, -before, before)
             terminal = np.where(held, turned, np.where(before == 0, off, before))
         hinge = self.hinge_arguments(point.d) > 0.0
-        return _ActiveSet(hinge, *self.bounds_at(point), terminal)
+        spheres = computed_with.spheres
+        if spheres is not None:
+            spheres = ball.at(sub, point.e, spheres)
+        return _ActiveSet(hinge, *self.bounds_at(point), terminal, spheres)
 
-    def near(self, point: Point) -> _ActiveSet:
-        """Pieces the solution of the interior point lies on, or almost.
+    def near(self, point: Point, press: Array) -> _ActiveSet:
+        """Pieces the solution of the interior point lies on, or almost; `press` is of the balls.
 
         Of a slack and its multiplier, the one that is smaller for its kind is the one that
         vanishes.
@@ -246,7 +287,8 @@ class _Pieces:
         if sub.tolerance > 0.0:
             terminal = np.where(-beyond > share, 0, terminal)
         hinge = self.hinge_arguments(point.d) > 0.0
-        return _ActiveSet(hinge, *self.bounds_near(point), terminal)
+        spheres = ball.near(sub, point.e, press) if self.balls else None
+        return _ActiveSet(hinge, *self.bounds_near(point, spheres), terminal, spheres)
 
     def bounds_at(self, point: Point) -> tuple[Array, Array]:
         """Lower and upper bounds that a Newton point passes (active ones by a hair)."""
@@ -254,16 +296,21 @@ class _Pieces:
             return self._off, self._off
         return point.e < self.sub.lower, point.e > self.sub.upper
 
-    def bounds_near(self, point: Point) -> tuple[Array, Array]:
+    def bounds_near(self, point: Point, spheres: ball.Spheres | None) -> tuple[Array, Array]:
         """Lower and upper bounds that hold the interior point's solution, as in :meth:`near`."""
         if not self.bounded:
             return self._off, self._off
-        sub = self.sub
-        slope = np.matmul(sub.R, point.e[..., None])[..., 0] + sub.r
-        slope += np.matmul(point.adjoint[:, None], sub.B)[:, 0]
+        sub, slope = self.sub, self.slope(point)
+        if spheres is not None:  # what they hold the bounds need not
+            slope += spheres.press[:, None] * spheres.turn
         slope /= max(1.0, float(np.max(np.abs(slope))))
         size = 1.0 + np.abs(point.e)
         return (point.e - sub.lower) / size < slope, (sub.upper - point.e) / size < -slope
+
+    def slope(self, point: Point) -> Array:
+        """Gradient of the objective with respect to the controls, (K, m)."""
+        slope = np.matmul(self.sub.R, point.e[..., None])[..., 0] + self.sub.r
+        return slope + np.matmul(point.adjoint[:, None], self.sub.B)[:, 0]
 
     def objective(self, point: Point) -> float:
         """The objective with bounds as stiff penalties, for comparing points."""
@@ -279,8 +326,8 @@ class _Pieces:
         return float(value)
 
     def replayed(self, point: Point) -> Point:
-        """The point with its controls clipped to their bounds and the states they lead to."""
-        e = np.clip(point.e, self.sub.lower, self.sub.upper)
+        """The point with its controls made admissible and the states they lead to."""
+        e = self.sub.admissible(point.e)
         return dataclasses.replace(point, d=self.sub.response(e), e=e)
 
     def objective_of(self, point: Point) -> float:

@@ -24,7 +24,7 @@ def registered(monkeypatch):
     entry = importlib.metadata.EntryPoint(
         "Scenario", "slipcar.envs.scenario:Scenario", "slipcar.problems"
     )
-    module = importlib.import_module(Plan.__module__)
+    module = importlib.import_module("slipcar.planner.plan_file")
     monkeypatch.setattr(
         module, "entry_points", lambda group: [entry] if group == "slipcar.problems" else []
     )
@@ -180,7 +180,7 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(format=99), "format 99; this version reads 1"),
+        (lambda h, a: h.update(format=99), "format 99; this version reads 2"),
         (lambda h, a: h.pop("format"), "format None"),
         (lambda h, a: h.pop("effort"), "damaged.*effort"),
         (lambda h, a: h.update(status="FINE"), "damaged.*FINE"),

@@ -20,13 +20,22 @@ CASES = {
     "paper, literal": (PAPER, {"linearization": "literal"}, (0, 5, 30, -1)),
     "paper, terminal box": (PAPER, {"terminal_tolerance": 1e-3}, (0, 3, -1)),
     "paper, wide box": (PAPER, {"terminal_tolerance": 0.3}, (0, 3, -1)),
-    "paper, unreachable": (PAPER.replace(control_bounds=(0.2, 0.4)), {}, (0, 3)),
-    "paper, unreachable box": (
-        PAPER.replace(control_bounds=(0.3, 0.4)),
-        {"terminal_tolerance": 0.05},
+    # Without a trust region the bounds act from the first step.
+    "paper, unreachable": (
+        PAPER.replace(control_bounds=(0.2, 0.4)),
+        {"trust_region": "none"},
         (0, 3),
     ),
-    "uncontrollable guess": (PAPER, {"guess": (START_AT_REST, np.zeros((40, 2)))}, (0, 1)),
+    "paper, unreachable box": (
+        PAPER.replace(control_bounds=(0.3, 0.4)),
+        {"trust_region": "none", "terminal_tolerance": 0.05},
+        (0, 3),
+    ),
+    "uncontrollable guess": (
+        PAPER,
+        {"guess": (START_AT_REST, np.zeros((40, 2))), "cold_start": "never"},
+        (0, 1),
+    ),
     "world 5": (Scenario.random(5), {}, (0, 2, -1)),
     "world 12, bounded": (Scenario.random(12, control_bounds=(0.7, 1.5)), {}, (0, 2, -1)),
     "turned world 8": (Scenario.random(8, turned=True), {"variance_weight": 30.0}, (0, 2, -1)),
@@ -59,7 +68,7 @@ def met():
         for name, (problem, options, which) in CASES.items():
             recorder = Recorder()
             patch.setitem(backends.BACKENDS, "structured", lambda recorder=recorder: recorder)
-            plan(problem, **options)
+            plan(problem, method="convex", free_first=False, **options)
             found[name] = [recorder.subs[i] for i in which]
     return found
 
@@ -200,7 +209,7 @@ def test_osqp_updated_in_place_equals_a_fresh_set_up(met):
 
 def test_an_uncontrollable_linearisation_is_solved_and_says_what_is_missing():
     # The released start: θ = v = 0 along the line leaves r_y out of reach.
-    p = plan(PAPER, guess=(START_AT_REST, np.zeros((40, 2))))
+    p = plan(PAPER, guess=(START_AT_REST, np.zeros((40, 2))), cold_start="never", method="convex")
     first = p.history[0]
     np.testing.assert_allclose(first.mean[:, 1], 0.0, atol=1e-9)
     assert first.virtual_control >= 3.0  # all of r_y is missing

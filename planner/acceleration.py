@@ -1,0 +1,82 @@
+"""Beyond plain steps, once the iteration has settled down to a slow linear rate.
+
+The convex model knows no curvature of the dynamics, so that z_{k+1} = F(z_k) contracts (or, near
+a saddle, leaves) at a fixed rate per direction, at times as slow as ± 0.97.
+
+* Where the merit function falls by more than the model says, ratio > 1, the model's curvature is
+  too large along the step. By the parabola through both, the minimum lies at t = 1/(2 − ratio)
+  times the step: go there (a long way, where the ratio is 2: no curvature is left).
+* Otherwise combine the last iterates by Anderson's method: with residuals r_i = F(z_i) − z_i
+
+      z = Σ α_i (z_i + r_i),   Σ α_i = 1,   ‖Σ α_i r_i‖ least
+
+  (D. G. Anderson, 1965; Walker and Ni, 2011: GMRES on the linearised iteration). The norm is that
+  of the stopping test, ∫ ‖e‖² dt; states are combined with the weights of the controls, so that
+  the combination obeys the linearised dynamics as its members do.
+
+These are proposals: the caller takes them where they lower the merit function below the step's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+Array = np.ndarray
+
+#: Iterates combined, at most; the reduction of ∫ ‖e‖² by a step that is fast enough, and how many
+#: slow ones are let pass; the ratio from which steps are lengthened, and how much at most.
+_DEPTH, _FAST, _PATIENCE, _LONGER, _LONGEST = 6, 0.1, 2, 1.5, 10.0
+
+
+class Acceleration:
+    """Remembers the last few steps and proposes where to go instead of the next one.
+
+    Args:
+        dt: interval lengths, (K,) [s].
+    """
+
+    def __init__(self, dt: Array) -> None:
+        self._weight = np.sqrt(dt)[:, None]
+        self._steps: list[tuple[Array, Array, Array]] = []  # residual, states, controls
+        self._last, self._slow = 0.0, 0
+
+    def forget(self) -> None:
+        """Start anew: the iteration is not what it was (another trust region, other bounds)."""
+        self._steps.clear()
+        self._last, self._slow = 0.0, 0
+
+    def observe(self, u: Array, new_x: Array, e: Array) -> bool:
+        """Take note of a step, and say whether steps have become slow.
+
+        Args:
+            u: iterate, (K, m).
+            new_x: states the step leads to, (N, n).
+            e: change of the controls, (K, m).
+        """
+        residual = (self._weight * e).ravel()
+        size = float(residual @ residual)
+        self._slow = self._slow + 1 if size > _FAST * self._last > 0.0 else 0
+        self._last = size
+        self._steps.append((residual, new_x, u + e))
+        del self._steps[:-_DEPTH]
+        return self._slow >= _PATIENCE
+
+    def propose(self, x: Array, u: Array, ratio: float) -> list[tuple[Array, Array]]:
+        """States (N, n) and controls (K, m) to try in turn instead of the step observed last.
+
+        Args:
+            x: iterate, (N, n).
+            u: iterate, (K, m).
+            ratio: decrease of the merit function by the step over that by the model.
+        """
+        residual, new_x, new_u = self._steps[-1]
+        if ratio > _LONGER:
+            self._steps.clear()
+            t = min(1.0 / max(2.0 - ratio, 1e-3), _LONGEST)
+            return [(x + s * (new_x - x), u + s * (new_u - u)) for s in (t, t / 3.0) if s > 1.0]
+        if len(self._steps) < 2:
+            return []
+        residuals, states, controls = (np.array(parts) for parts in zip(*self._steps, strict=True))
+        gamma = np.linalg.lstsq(np.diff(residuals, axis=0).T, residual, rcond=1e-8)[0]
+        alpha = np.diff(gamma, prepend=0.0, append=1.0)
+        return [(np.einsum("i,ikn->kn", alpha, states), np.einsum("i,ikm->km", alpha, controls))]

@@ -1,0 +1,217 @@
+"""`plan_batch`: many problems, or many starts of one, at once.
+
+Problems of one kind on grids of one size go to the compiled iteration together, dynamics and all,
+in parallel threads. What cannot be compiled, or does not converge there, is planned one by one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner import checks
+from slipcar.planner.build import build
+from slipcar.planner.method import driver, known_functions, second_chance, solve, uses_newton
+from slipcar.planner.newton.functions import Functions
+from slipcar.planner.options import Options, check_count
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.plan import Plan
+from slipcar.planner.problem import Model, Problem, model_of
+from slipcar.planner.reposed import reposed
+from slipcar.planner.warm_start import given_guess
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A model and where to start.
+
+    Attributes:
+        model: the completed problem.
+        x: guess, (N, n).
+        u: guess, (K, m).
+        free_first: whether to leave penalties out at first.
+    """
+
+    model: Model
+    x: Array
+    u: Array
+    free_first: bool
+
+
+def plan_batch(
+    problems: Sequence[Problem] | Problem,
+    *,
+    initial_states: Any = None,
+    guesses: Sequence[Any] | None = None,
+    workers: int = 0,
+    history: bool = False,
+    **options: Any,
+) -> list[Plan]:
+    """Plan many problems at once; each plan is the one that `plan` would give.
+
+    Args:
+        problems: a sequence of problems, or one problem with `initial_states`.
+        initial_states: states to start one problem from, (P, n).
+        guesses: where to begin for each: a `Plan`, (states, controls), or None for its own; a
+            guess is trusted, as `plan(..., cold_start="never")` does.
+        workers: threads; 0 takes one for each processor. The plans do not depend on it.
+        history: keep the trajectories of every iteration, as `plan` does; large.
+        **options: `variance_weight`, `method`, `solver`, `tolerance`, `max_iterations`,
+            `trust_region`, `linearization`, `terminal_tolerance`, `integrator`, `free_first` of
+            :func:`plan`.
+
+    Returns:
+        One plan for each, in order. Look at every `status`; `solve_time` is the batch's, shared
+        out equally.
+
+    Raises:
+        TypeError: if a problem lacks a required member, or for an unknown option.
+        ValueError: for a wrong option, shape or value, naming its index in the batch.
+    """
+    began = time.perf_counter()
+    free_first = options.pop("free_first", None)
+    known = {field.name for field in dataclasses.fields(Options)} - {"callback"}
+    if unknown := sorted(set(options) - known):
+        raise TypeError(f"plan_batch knows no option {unknown}; it knows {sorted(known)}")
+    chosen = Options(**options)
+    if workers != 0:
+        check_count("workers", workers)
+    models, posed = _models(problems, initial_states, chosen)
+    if guesses is not None and len(guesses) != len(models):
+        raise ValueError(f"guesses must be one for each of {len(models)}, not {len(guesses)}")
+    tasks = []
+    for i, model in enumerate(models):
+        given = None if guesses is None else guesses[i]
+        try:
+            x, u = model.guess() if given is None else given_guess(model, given)
+            if initial_states is None or i == 0:
+                checks.check_once(model, x, u)
+        except ValueError as error:
+            raise ValueError(f"problem {i} of the batch: {error}") from error
+        first = given is None if free_first is None else bool(free_first)
+        tasks.append(Task(model, x, u, first))
+    outcomes = solve_tasks(tasks, chosen, workers=workers, history=history)
+    record = {**chosen.as_dict(), "free_first": free_first}
+    share = (time.perf_counter() - began) / max(len(tasks), 1)
+    return [
+        build(
+            outcome, task.model, problem, guess=task.x, options=record, seconds=share
+        )
+        for task, problem, outcome in zip(tasks, posed, outcomes, strict=True)
+    ]
+
+
+def solve_tasks(
+    tasks: Sequence[Task], options: Options, *, workers: int = 0, history: bool = True
+) -> list[Outcome]:
+    """Outcomes of all, in order: together where they can be compiled, else one by one."""
+    found: list[Outcome | None] = [None] * len(tasks)
+    if driver() is not None and options.callback is None:
+        groups: dict[Any, list[tuple[int, Functions]]] = {}
+        for i, task in enumerate(tasks):
+            if not uses_newton(task.model, options):
+                continue
+            functions = known_functions(task.model, task.x, task.u)
+            if functions is not None:
+                key = (id(functions.kernels), task.x.shape, len(task.model.weight))
+                groups.setdefault(key, []).append((i, functions))
+        for group in groups.values():
+            for (i, _), outcome in zip(
+                group, _together(tasks, group, options, workers, history), strict=True
+            ):
+                found[i] = outcome
+    return [
+        outcome or solve(task.model, options, task.x, task.u, free_first=task.free_first)
+        for task, outcome in zip(tasks, found, strict=True)
+    ]
+
+
+def _together(
+    tasks: Sequence[Task],
+    group: list[tuple[int, Functions]],
+    options: Options,
+    workers: int,
+    history: bool,
+) -> list[Outcome | None]:
+    """One call of the compiled iteration; None where a function is not finite along a guess."""
+    fast = driver()
+    assert fast is not None
+    members = [tasks[i] for i, _ in group]
+    kernels = group[0][1].kernels
+    models = [task.model for task in members]
+    if all(
+        getattr(model, name) is getattr(models[0], name)
+        for model in models
+        for name in ("times", "R", "lower", "upper", "weight")
+    ):
+        models = models[:1]
+    answers = fast.run(
+        kernels,
+        models,
+        np.stack([functions.parameters for _, functions in group]),
+        np.stack([task.x for task in members]),
+        np.stack([task.u for task in members]),
+        variance_weight=options.variance_weight,
+        tolerance=options.tolerance,
+        max_iterations=options.max_iterations,
+        keep=options.max_iterations if history else 0,
+        free_first=np.array([task.free_first for task in members]),
+        workers=workers,
+    )
+    seconds = answers.seconds / len(members)
+    return [
+        second_chance(
+            task.model, options, task.x, task.u,
+            answers.outcome(i, options.variance_weight, seconds),
+        )
+        if answers.finite(i)
+        else None
+        for i, task in enumerate(members)
+    ]  # fmt: skip
+
+
+def _models(
+    problems: Any, initial_states: Any, options: Options
+) -> tuple[list[Model], list[Problem]]:
+    """Completed problems, and the problems that their plans belong to, in order."""
+    if initial_states is None:
+        if not isinstance(problems, Sequence):
+            raise TypeError(
+                f"problems must be a sequence of problems, or one problem with initial_states, "
+                f"not {type(problems).__name__}"
+            )
+        return [_completed(problem, options) for problem in problems], list(problems)
+    if isinstance(problems, Sequence):
+        raise ValueError("initial_states go with one problem, not with a sequence of problems")
+    model = _completed(problems, options)
+    states = np.array(initial_states, dtype=np.float64)
+    if states.ndim != 2 or states.shape[1] != model.state_dim:
+        raise ValueError(
+            f"initial_states must have shape (any, {model.state_dim}), not {states.shape}"
+        )
+    if not np.isfinite(states).all():
+        i = int(np.argwhere(~np.isfinite(states))[0, 0])
+        raise ValueError(f"initial_states[{i}] must be finite, not {states[i]}")
+    states.setflags(write=False)
+    posed = [reposed(problems, start=start) for start in states]
+    # Their own guesses, but the functions of one model: they are compiled and compared once.
+    guess = [getattr(problem, "initial_guess", None) for problem in posed]
+    return [
+        dataclasses.replace(model, start=start, own_guess=own)
+        for start, own in zip(states, guess, strict=True)
+    ], posed
+
+
+def _completed(problem: Problem, options: Options) -> Model:
+    model = model_of(problem)
+    if options.integrator != model.integrator:
+        model = dataclasses.replace(model, integrator=options.integrator)
+    return model
+
+

@@ -1,0 +1,476 @@
+"""SCP with one LQ problem per iteration and the curvature of the Lagrangian.
+
+Each iteration solves one quadratic model, cut down to what is smooth at the iterate:
+
+* the hinges max(0, c)² that are on at the iterate are squares, the others are off. That is the
+  gradient at the iterate, so a step is a direction of descent; which hinges are on settles over
+  the iterations rather than within each (as exact sub-problems do it);
+* bounds of the controls are kept exactly: the LQ problem is solved again while the set of active
+  ones changes;
+* without a better guess, hinges are left out at first, until steps are short: which way round the
+  obstacles is then decided by where the free path runs, not by where the guess did;
+* at first the model is that of the paper's convex sub-problem. Whole steps are taken: bold ones
+  are what finds a way. When they are no longer than the controls, or after some number of them,
+  the curvature of dynamics, hinges and terminal condition is added, weighed by the
+  multipliers: Newton's method on the optimality conditions, quadratic at the end;
+* where the model is then not convex in the controls (a pivot of the Riccati recursion is not
+  positive), a multiple of the identity is added: a trust region by its multiplier, −p¹ of the
+  paper. A line search on a merit function makes it descend;
+* after a few rejected steps in a row the convex model's step, searched further, goes first;
+* steps that no longer become shorter go round in circles (between sets of hinges, as a rule): then
+  the multiple of the identity is kept from vanishing.
+
+The merit function is Φ = cost + Σ λᵀf + νᵀg + s (½ max|λ| ‖f‖₁ + ½ max|ν| ‖g‖₁), f the defects of
+the dynamics and g the terminal condition, with s ≥ 1 large enough that the step descends. In its
+variance term the adjoint weights Λ of the iterate are held, as in the model (:mod:`..moments`).
+
+Its fixed points are those of the paper's scheme, extremals. On 1000 random worlds it converged
+from every one, where exact convex sub-problems under a trust region did from 98.5 %
+(`python benchmarks/run.py --only worlds`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+
+from slipcar.planner import moments
+from slipcar.planner.convexify import Linearization, nearest_semidefinite
+from slipcar.planner.feasibility import not_finite
+from slipcar.planner.history import Iteration
+from slipcar.planner.newton.functions import Functions
+from slipcar.planner.newton.lq import LqSolution, solve_lq
+from slipcar.planner.newton.settings import TUNING
+from slipcar.planner.options import Options
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.problem import Model
+from slipcar.planner.status import Status
+
+Array = np.ndarray
+#: Steps to where the model is not finite are rejected: no warning is needed on the way.
+_quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+
+@dataclasses.dataclass(frozen=True)
+class Iterate:
+    """Everything known at (x, u).
+
+    Attributes:
+        lin: values and first derivatives.
+        d_ell: ∂ℓ/∂x at nodes 0..K−1, (K, m, n).
+        H_xx: Hessian of H at nodes 1..K, (K, n, n).
+        variance: w ∫ tr Σ dt as a quadratic, or None for w = 0.
+        weights: w dt Λ, what σσᵀ of each node is weighed by in it, (K, n, n), or None.
+    """
+
+    lin: Linearization
+    d_ell: Array
+    H_xx: Array
+    variance: moments.Variance | None
+    weights: Array | None
+
+    @property
+    def finite(self) -> bool:
+        """Whether the problem's functions are finite everywhere."""
+        return self.lin.finite and all(np.isfinite(a).all() for a in (self.d_ell, self.H_xx))
+
+    @property
+    def cost(self) -> float:
+        """Effort, penalty, running cost and w ∫ tr Σ dt."""
+        lin = self.lin
+        variance = 0.0 if self.variance is None else self.variance.value
+        return lin.effort + lin.penalty + lin.running + variance
+
+
+@dataclasses.dataclass(frozen=True)
+class _Quadratic:
+    """The model of the cost without its hinges; arguments of `solve_lq`."""
+
+    Q: Array
+    q: Array
+    R: Array
+    r: Array
+    S: Array
+
+
+def iterate(
+    model: Model,
+    functions: Functions,
+    options: Options,
+    x: Array,
+    u: Array,
+    *,
+    free_first: bool,
+) -> Outcome:
+    """Run the iteration from the guess x (N, n), u (N−1, m); `free_first` leaves hinges out first.
+
+    Raises:
+        ValueError: if the model functions are not finite along the guess.
+    """
+    w = options.variance_weight
+    clock = time.perf_counter()
+    at = evaluate(model, functions, w, x, u)
+    if not at.finite:
+        raise ValueError(f"{not_finite(at.lin)} is not finite along the guess")
+    K, n = at.lin.defect.shape
+    q = len(at.lin.g)
+    adjoint, terminal = np.zeros((K, n)), np.zeros(q)
+    shift, last, rejected, kappa, settling = 0.0, np.inf, 0, 0.0, np.inf
+    unit = float(np.max(np.diag(model.R)))  # of a shift
+    bounds = (np.zeros(u.shape, dtype=bool), np.zeros(u.shape, dtype=bool))
+    history: list[Iteration] = []
+    status = Status.MAX_ITERATIONS
+    circling = _Circling(unit)
+    released = free_first and len(model.weight) > 0
+    for iteration in range(options.max_iterations):
+        if released and (
+            settling < TUNING.released * at.lin.effort or iteration >= TUNING.released_steps
+        ):
+            released, last = False, np.inf
+        newton = not released and bool(history) and (iteration >= TUNING.free_steps or settling < TUNING.settled * at.lin.effort)
+        fallback = rejected >= TUNING.rejections
+        curved = newton and not fallback
+        quadratic = _quadratic(model, functions, at, adjoint, terminal, curved)
+        linearized = time.perf_counter()
+        solves, found = 0, None
+        for _ in range(TUNING.inertia_trials):
+            found, bounds, more = _solve(
+                model,
+                at,
+                quadratic,
+                bounds,
+                np.zeros_like(model.weight) if released else model.weight,
+                shift if curved else 0.0,
+                kappa if newton else 0.0,
+            )
+            solves += more
+            if found is not None or not curved:
+                break
+            shift = max(TUNING.shift_up * shift, TUNING.first_shift * unit)
+        solved = time.perf_counter()
+        if found is None:
+            status = Status.SOLVER_FAILED
+            break
+        if not newton and q > 0:
+            kappa = TUNING.terminal_curvature * q / found.gramian
+        search = _search(model, functions, w, at, quadratic, found, newton, fallback)
+        new, alpha, accepted = search.new, search.alpha, search.accepted
+        step = alpha**2 * float(np.vdot(model.dt[:, None] * search.e, search.e))
+        radius = alpha**2 * float(np.einsum("k,ki,ki", model.dt, found.d, found.d))
+        done = time.perf_counter()
+        history.append(
+            Iteration(
+                mean=new.lin.x,
+                controls=new.lin.u,
+                effort=new.lin.effort,
+                penalty=new.lin.penalty,
+                running=new.lin.running,
+                variance=np.nan if new.variance is None else new.variance.value / w,
+                merit=search.merit,
+                predicted=search.predicted,
+                actual=search.actual,
+                step=step,
+                trust_radius=radius,
+                trust_multiplier=shift if curved else 0.0,
+                virtual_control=0.0,
+                defect=float(np.max(np.abs(new.lin.defect))),
+                terminal_residual=float(np.max(np.abs(new.lin.g), initial=0.0)),
+                terminal_multiplier=found.terminal,
+                accepted=accepted,
+                solver_iterations=solves,
+                linearize_seconds=linearized - clock + done - solved,
+                solve_seconds=solved - linearized,
+            )
+        )
+        stop = options.callback is not None and options.callback(history[-1])
+        clock = time.perf_counter()
+        if not accepted:
+            if not newton or fallback:
+                status = Status.STALLED if newton else Status.SOLVER_FAILED
+                break
+            rejected += 1
+            shift = max(TUNING.shift_up * shift, 0.1 * TUNING.first_shift * unit)
+        else:
+            settling, length = step * unit, step
+            # A short step that a shift made short proves nothing: the force it stands for,
+            # p¹ (x − x_k), must vanish too.
+            step += shift**2 * radius if curved else 0.0
+            rejected = 0
+            if newton:
+                circling.notice(length)
+                shift = max(_next_shift(shift, unit, search), circling.floor)
+            at, adjoint, terminal = new, found.adjoint, found.terminal
+            short = alpha == 1.0 and step + last <= options.tolerance
+            if short and not released and _consistent(at.lin):
+                status = Status.CONVERGED
+                break
+            last = step
+        if stop:
+            status = Status.STOPPED
+            break
+    lin = at.lin
+    return Outcome(
+        status=status,
+        x=lin.x,
+        u=lin.u,
+        A=lin.A,
+        B=lin.B,
+        covariance=moments.covariance(lin.A, lin.sigma, model.dt),
+        effort=lin.effort,
+        penalty=lin.penalty,
+        running=lin.running,
+        adjoint=adjoint,
+        terminal=terminal,
+        trust_multiplier=0.0,
+        iterations=len(history),
+        history=tuple(history),
+        objective=at.cost,
+    )
+
+
+@_quiet
+def evaluate(model: Model, functions: Functions, w: float, x: Array, u: Array) -> Iterate:
+    """Values and first derivatives at x (N, n), u (K, m)."""
+    (K, m), n = u.shape, x.shape[1]
+    t, dt = model.times, model.dt
+    stage = functions.stage(t=t[:-1], dt=dt, x=x[:-1], u=u)
+    node = functions.node(t=t[1:], x=x[1:])
+    terminal = functions.terminal(x=x[-1:])
+    A, sigma = stage["A"].reshape(K, n, n), stage["sigma"].reshape(K, n, -1)
+    ell, d_ell = stage["ell"], stage["d_ell"].reshape(K, m, n)
+    H_x, H_xx = node["H_x"], node["H_xx"].reshape(K, n, n)
+    c = node["c"]
+    column = dt[:, None]
+    lin = Linearization(
+        x=x,
+        u=u,
+        A=A,
+        B=stage["B"].reshape(K, n, m),
+        defect=stage["next"] - x[1:],
+        sigma=sigma,
+        c=c,
+        C=node["C"].reshape(K, -1, n) if c.shape[1] else np.zeros((K, 0, n)),
+        g=terminal["g"][0],
+        G=terminal["G"].reshape(-1, n),
+        effort=float(np.vdot(column * u, u @ model.R)),
+        penalty=float(np.vdot(column * model.weight, np.maximum(c, 0.0) ** 2)),
+        running=float(np.vdot(column * ell, u) + np.vdot(dt, node["H"][:, 0])),
+        q_running=column * H_x,
+        r_running=column * ell,
+    )
+    if model.control_cost is not None:
+        lin.q_running[:-1] += column[1:] * np.einsum("kmn,km->kn", d_ell[1:], u[1:])
+    variance, weights = None, None
+    if w > 0.0:
+        d_sigma = stage["d_sigma"].reshape(*sigma.shape, n)
+        Lambda = moments.adjoint_weights(A, dt)
+        variance = moments.variance_penalty(w, sigma, d_sigma, Lambda, dt)
+        weights = w * dt[:, None, None] * Lambda
+    return Iterate(lin, d_ell, H_xx, variance, weights)
+
+
+def _quadratic(
+    model: Model,
+    functions: Functions,
+    at: Iterate,
+    adjoint: Array,
+    terminal: Array,
+    curved: bool,
+) -> _Quadratic:
+    """The quadratic model at an iterate, hinges and shift left out."""
+    lin, dt = at.lin, model.dt
+    (K, m), n = lin.u.shape, lin.x.shape[1]
+    assert lin.q_running is not None and lin.r_running is not None
+    q = lin.q_running.copy()
+    Q = dt[:, None, None] * at.H_xx
+    R = 2.0 * dt[:, None, None] * model.R
+    r = np.einsum("kij,kj->ki", R, lin.u) + lin.r_running
+    S = np.zeros((K, m, n))
+    if curved:
+        t = model.times
+        second = functions.stage_hessian(
+            t=t[:-1], dt=dt, x=lin.x[:-1], u=lin.u, adjoint=adjoint
+        )
+        Q[:-1] += second["xx"].reshape(K, n, n)[1:]
+        S = second["ux"].reshape(K, m, n)
+        R += second["uu"].reshape(K, m, m)
+        if lin.c.shape[1]:
+            eta = 2.0 * dt[:, None] * model.weight * np.maximum(lin.c, 0.0)
+            Q += functions.node_hessian(t=t[1:], x=lin.x[1:], weight=eta)["xx"].reshape(K, n, n)
+        bent = functions.terminal_hessian(x=lin.x[-1:], multiplier=terminal[None])["xx"]
+        Q[-1] += bent.reshape(n, n)
+    elif at.H_xx.any():
+        Q = nearest_semidefinite(Q)
+    if at.variance is not None:
+        # σ at the last node drives nothing; node 0 is fixed.
+        q[:-1] += at.variance.gradient[1:]
+        Q[:-1] += at.variance.hessian[1:]
+    return _Quadratic(Q, q, R, r, S)
+
+
+def _solve(
+    model: Model,
+    at: Iterate,
+    quadratic: _Quadratic,
+    bounds: tuple[Array, Array],
+    weight: Array,
+    shift: float,
+    kappa: float,
+) -> tuple[LqSolution | None, tuple[Array, Array], int]:
+    """Solve the model with the hinges that are on, weighed; the active bounds; LQ problems solved."""
+    lin, dt = at.lin, model.dt
+    h = 2.0 * dt[:, None] * weight * (lin.c > 0.0)
+    Q = quadratic.Q + np.einsum("kp,kpi,kpj->kij", h, lin.C, lin.C)
+    q = quadratic.q + np.einsum("kp,kp,kpi->ki", h, lin.c, lin.C)
+    R = quadratic.R
+    if shift > 0.0:
+        level = 2.0 * shift * dt[:, None, None]
+        Q, R = Q + level * np.eye(Q.shape[1]), R + level * np.eye(R.shape[1])
+    if kappa > 0.0:
+        Q[-1] += kappa * lin.G.T @ lin.G
+        q[-1] += kappa * lin.G.T @ lin.g
+    bounded = model.bounded
+    lower, upper = model.lower - lin.u, model.upper - lin.u
+    stiffness = TUNING.bound_stiffness * 2.0 * float(np.max(dt) * np.max(np.diag(model.R)))
+    diagonal = np.arange(R.shape[1])
+    found = None
+    for solves in range(1, TUNING.bound_rounds + 1):
+        low, high = bounds
+        Rb, rb = R, quadratic.r
+        if bounded and (low.any() or high.any()):
+            Rb, on = R.copy(), low | high
+            Rb[:, diagonal, diagonal] += stiffness * on
+            rb = rb - stiffness * np.where(high, upper, np.where(low, lower, 0.0))
+        found = solve_lq(lin.A, lin.B, lin.defect, Q, q, Rb, rb, quadratic.S, lin.G, lin.g)
+        if found is None or not bounded:
+            return found, bounds, solves
+        new = (found.e < lower, found.e > upper)
+        if np.array_equal(new[0], low) and np.array_equal(new[1], high):
+            return found, bounds, solves
+        if solves < TUNING.bound_rounds:
+            bounds = new
+    # The set does not settle: clip the controls and let the states follow.
+    assert found is not None
+    e, d = np.clip(lin.u + found.e, model.lower, model.upper) - lin.u, np.empty_like(found.d)
+    state = np.zeros(d.shape[1])
+    for k in range(len(d)):
+        state = d[k] = lin.A[k].dot(state) + lin.B[k].dot(e[k]) + lin.defect[k]
+    return dataclasses.replace(found, d=d, e=e), bounds, solves
+
+
+@dataclasses.dataclass(frozen=True)
+class _Search:
+    """Where a line search ended."""
+
+    new: Iterate
+    e: Array
+    alpha: float
+    accepted: bool
+    merit: float
+    predicted: float
+    actual: float
+    noise: float
+
+
+def _search(
+    model: Model,
+    functions: Functions,
+    w: float,
+    at: Iterate,
+    quadratic: _Quadratic,
+    found: LqSolution,
+    newton: bool,
+    fallback: bool,
+) -> _Search:
+    """Shorten the step until the merit function falls; free steps are taken whole."""
+    lin, dt, d = at.lin, model.dt, found.d
+    e = np.clip(lin.u + found.e, model.lower, model.upper) - lin.u
+    value = at.cost - lin.penalty
+    value += float(np.vdot(quadratic.q, d) + 0.5 * np.einsum("ki,kij,kj", d, quadratic.Q, d))
+    value += float(np.vdot(quadratic.r, e) + 0.5 * np.einsum("ki,kij,kj", e, quadratic.R, e))
+    value += float(np.einsum("ki,kij,kj", e[1:], quadratic.S[1:], d[:-1]))
+    c = np.maximum(np.einsum("kpn,kn->kp", lin.C, d) + lin.c, 0.0)
+    value += float(np.vdot(dt[:, None] * model.weight, c * c))
+    price = 0.5 * float(np.max(np.abs(found.adjoint)))
+    dear = 0.5 * float(np.max(np.abs(found.terminal), initial=0.0))
+
+    def lagrangian(point: Iterate) -> tuple[float, float]:
+        """Cost + λᵀf + νᵀg, and what is lacking, priced."""
+        f, g = point.lin.defect, point.lin.g
+        lacking = price * float(np.abs(f).sum()) + dear * float(np.abs(g).sum())
+        cost = point.lin.effort + point.lin.penalty + point.lin.running
+        if at.weights is not None:
+            cost += float(np.vdot(at.weights @ point.lin.sigma, point.lin.sigma))
+        return cost + float(np.vdot(found.adjoint, f) + np.vdot(found.terminal, g)), lacking
+
+    before, lacking = lagrangian(at)
+    gain = before - value
+    factor = max(1.0, -gain / (0.75 * lacking)) if lacking > 0.0 else 1.0
+    before += factor * lacking
+    predicted = gain + factor * lacking
+    noise = TUNING.noise * (1.0 + abs(before))
+    alpha, trials = 1.0, (TUNING.long_searches if fallback else TUNING.searches) if newton else 1
+    for trial in range(trials):
+        x = lin.x.copy()
+        x[1:] += alpha * d
+        new = evaluate(model, functions, w, x, lin.u + alpha * e)
+        merit, actual, accepted = np.inf, -np.inf, False
+        if new.finite:
+            merit, rest = lagrangian(new)
+            merit += factor * rest
+            actual = before - merit
+            accepted = (
+                not newton
+                or (predicted <= noise and actual >= -noise)
+                or actual >= TUNING.armijo * alpha * predicted
+            )
+        if accepted or trial == trials - 1:
+            break
+        alpha *= 0.5
+    return _Search(new, e, alpha, accepted, merit, predicted, actual, noise)
+
+
+class _Circling:
+    """Notices steps that no longer become shorter, and keeps the shift from falling."""
+
+    def __init__(self, unit: float) -> None:
+        self.floor = 0.0
+        self._shortest, self._stale, self._unit = np.inf, 0, unit
+
+    def notice(self, step: float) -> None:
+        """One more Newton step of this length, ∫‖Δu‖² dt."""
+        least = TUNING.first_shift * self._unit
+        self._stale += 1
+        if step < 0.5 * self._shortest:
+            self._shortest, self._stale = step, 0
+            self.floor /= TUNING.shift_up
+            if self.floor < 0.01 * least:
+                self.floor = 0.0
+        elif self._stale == TUNING.patience:
+            self.floor, self._stale = max(TUNING.shift_up * self.floor, 0.1 * least), 0
+
+
+def _next_shift(shift: float, unit: float, search: _Search) -> float:
+    """Less after a step that did what the model said, more after one that did not."""
+    if search.alpha == 1.0 and (
+        search.actual > 0.7 * search.predicted or search.predicted <= search.noise
+    ):
+        return shift / TUNING.shift_down if shift > 0.01 * TUNING.first_shift * unit else 0.0
+    if search.alpha < 0.3 or search.actual < 0.1 * search.predicted:
+        return max(2.0 * shift, 0.01 * TUNING.first_shift * unit)
+    return shift
+
+
+def _consistent(lin: Linearization) -> bool:
+    """Whether the terminal condition holds and the mean is, to first order, the controls' path."""
+    size = 1.0 + float(np.max(np.abs(lin.x)))
+    if np.max(np.abs(lin.g), initial=0.0) > TUNING.feasibility * size:
+        return False
+    gap = np.zeros(lin.x.shape[1])
+    for A, defect in zip(lin.A, lin.defect, strict=True):
+        gap = A.dot(gap) + defect
+        if np.abs(gap).max() > TUNING.consistency * size:
+            return False
+    return True

@@ -1,0 +1,133 @@
+"""Plans in .npz files: arrays as they are, the rest as JSON. No pickled code is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slipcar.planner.multipliers import Multipliers
+from slipcar.planner.problem import Problem
+from slipcar.planner.history import Columns, Iteration
+from slipcar.planner.records import Alternative, TimeStep
+from slipcar.planner.status import Status
+
+if TYPE_CHECKING:
+    from slipcar.planner.plan import Plan
+
+Array = np.ndarray
+
+#: 2: running costs, alternatives, horizons tried.
+_FORMAT = 2
+_ARRAYS = ("times", "mean", "controls", "covariance", "guess", "A", "B", "gains")
+_SCALARS = (
+    "effort", "obstacle_cost", "running_cost", "variance", "iterations", "solve_time", "message",
+)  # fmt: skip
+
+
+def write(plan: Plan, path: str | os.PathLike[str]) -> Path:
+    """Write a plan, atomically; see `Plan.save`."""
+    path = Path(path)
+    if path.suffix != ".npz":
+        path = path.with_name(path.name + ".npz")
+    arrays: dict[str, Any] = {
+        name: getattr(plan, name) for name in _ARRAYS if getattr(plan, name) is not None
+    }
+    arrays |= {f"multipliers.{k}": v for k, v in plan.multipliers.as_dict().items()}
+    if len(plan.history):
+        columns = Columns.of(plan.history).columns
+        arrays |= {f"history.{name}": column for name, column in columns.items()}
+    header = {
+        "format": _FORMAT,
+        "status": plan.status.name,
+        "options": plan.options,
+        "problem": _problem_to_data(plan.problem),
+        "alternatives": [
+            {**dataclasses.asdict(row), "status": row.status.name} for row in plan.alternatives
+        ],
+        "time_search": [dataclasses.asdict(row) for row in plan.time_search],
+        **{name: getattr(plan, name) for name in _SCALARS},
+    }
+    arrays["header"] = np.array(json.dumps(header))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp.npz")
+    try:
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def read(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The fields of the plan that :func:`write` wrote; see `Plan.load`."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no plan at {path}")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays.pop("header")))
+        version = header.get("format")
+    except Exception as error:  # zipfile, NumPy and JSON each raise their own
+        raise ValueError(f"{path} is not a plan or is damaged: {error}") from error
+    if version != _FORMAT:
+        raise ValueError(f"{path} has plan format {version!r}; this version reads {_FORMAT}")
+    try:
+        return {
+            **{name: arrays[name] for name in _ARRAYS if name != "gains"},
+            **{name: header[name] for name in _SCALARS},
+            "gains": arrays.get("gains"),
+            "status": Status[header["status"]],
+            "history": _history_from(arrays),
+            "multipliers": Multipliers.from_dict(_strip(arrays, "multipliers.")),
+            "options": header["options"],
+            "problem": _problem_from_data(header["problem"]),
+            "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
+            "time_search": tuple(TimeStep(**row) for row in header["time_search"]),
+        }
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a plan or is damaged: {error!r}") from error
+
+
+def _alternative(row: dict[str, Any]) -> Alternative:
+    kind = row["homotopy"]
+    kind = tuple(kind) if isinstance(kind, list) else kind
+    return Alternative(**{**row, "status": Status[row["status"]], "homotopy": kind})
+
+
+def _strip(arrays: dict[str, Array], prefix: str) -> dict[str, Array]:
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _history_from(arrays: dict[str, Array]) -> Sequence[Iteration]:
+    columns = _strip(arrays, "history.")
+    if not columns:
+        return ()
+    if set(columns) != {field.name for field in dataclasses.fields(Iteration)}:
+        raise KeyError("history")
+    return Columns(columns)
+
+
+def _problem_to_data(problem: Problem | None) -> dict[str, str] | None:
+    to_json = getattr(problem, "to_json", None)
+    if to_json is None:
+        return None
+    cls = type(problem)
+    for entry in entry_points(group="slipcar.problems"):
+        if entry.value == f"{cls.__module__}:{cls.__qualname__}":
+            return {"class": entry.name, "json": to_json()}
+    return None
+
+
+def _problem_from_data(data: dict[str, str] | None) -> Any:
+    if data is None:
+        return None
+    for entry in entry_points(group="slipcar.problems"):
+        if entry.name == data["class"]:
+            return entry.load().from_json(data["json"])
+    return None

@@ -1,0 +1,181 @@
+"""`plan`: one problem, one call."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner import checks
+from slipcar.planner.backends import Solver
+from slipcar.planner.build import build
+from slipcar.planner.free_time import checked_bounds
+from slipcar.planner.free_time import free_final_time as search_time
+from slipcar.planner.history import Iteration
+from slipcar.planner.method import solve
+from slipcar.planner.options import Options, check_choice, check_count, check_number
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.plan import Plan
+from slipcar.planner.problem import Problem, model_of
+from slipcar.planner.reposed import reposed
+from slipcar.planner.shot import solve_shooting
+from slipcar.planner.starts import multistart
+from slipcar.planner.warm_start import given_guess, run_guarded
+
+Array = np.ndarray
+
+
+def plan(
+    problem: Problem,
+    *,
+    variance_weight: float = 1.0,
+    solver: str | Solver = "structured",
+    method: str = "auto",
+    tolerance: float = 1e-3,
+    max_iterations: int = 100,
+    trust_region: str | None = None,
+    linearization: str = "composite",
+    terminal_tolerance: float = 0.0,
+    integrator: str = "euler",
+    starts: int = 1,
+    guess: Plan | tuple[Array, Array] | None = None,
+    cold_start: str = "auto",
+    free_first: bool | None = None,
+    shooting: bool = False,
+    free_final_time: bool = False,
+    time_weight: float = 1.0,
+    final_time_bounds: tuple[float, float] | None = None,
+    check_derivatives: bool = False,
+    callback: Callable[[Iteration], bool | None] | None = None,
+) -> Plan:
+    """Plan by stochastic sequential convex programming (paper §3 and §6, SPEC §3).
+
+        minimise  ∫ uᵀRu + H(μ) + ℓ(μ)ᵀu + Σ w max(0, c(μ))² + variance_weight · tr Σ dt
+
+    Args:
+        problem: anything that satisfies :class:`slipcar.planner.Problem`; a Scenario does.
+        variance_weight: w ≥ 0; 0 is deterministic SCP.
+        solver: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with their interface; see
+            :mod:`slipcar.planner.backends`.
+        method: `"newton"`: one LQ problem per iteration and Newton's method at the end, quadratic
+            (:mod:`slipcar.planner.newton`); `"convex"`: the paper's scheme, exact convex
+            sub-problems. `"auto"` takes the first unless an option or the problem asks for the
+            second: another solver, a trust region, the literal linearisation, a terminal box, a
+            ball of controls. Where the first does not converge, the second goes on.
+        tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0.
+        max_iterations: at most so many sub-problems from each guess, ≥ 1.
+        trust_region: of the convex method: `"adaptive"` (None is), `"paper"` (Δ₀ = 100, × 0.99)
+            or `"none"`.
+        linearization: `"composite"` keeps max(0, ·)² and linearises its argument; `"literal"`
+            linearises the obstacle cost whole, as the paper writes it.
+        terminal_tolerance: half-width of a box round E g = 0; 0 asks for equality.
+        integrator: of the mean: `"euler"` (the paper's) or `"rk4"`; controls are constant on each
+            interval either way. See :mod:`slipcar.planner.integrators`.
+        starts: guesses to try, ≥ 1: the problem's own and others round the obstacles; the best
+            plan is returned and `alternatives` says what became of each.
+        guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
+            and controls (N−1, m); None takes the problem's own.
+        cold_start: when the problem's own guess is tried beside `guess` and the better plan
+            returned: `"auto"` unless `guess` is a converged plan that fits the problem at least
+            as well and leads to a converged one, `"always"` or `"never"`. A converged plan is a
+            local optimum, as a rule in its guess's homotopy class; only a comparison tells
+            whether the problem's own guess leads to a better one. `message` says which was taken.
+        free_first: leave the penalties out until the first steps have settled, so that the path
+            that would be best without obstacles decides which way round them, not the guess.
+            None: where Newton's method starts from the problem's own guess.
+        shooting: once an iterate of the convex method is near an extremal, solve the maximum
+            principle itself by Newton's method, to 1e-12 (paper §3.3, SPEC §3.8); SCP goes on
+            where that fails. `shot` says what became of it.
+        free_final_time: choose the horizon too: minimise cost + time_weight · T over a uniform
+            dilation of the time grid (paper §5); `final_time` and `time_search` say what came out.
+        time_weight: cost of a second of final time, > 0.
+        final_time_bounds: least and largest final time [s]; None is 1/10 and 10 times the
+            problem's.
+        check_derivatives: compare every Jacobian with differences before planning.
+        callback: called with each :class:`Iteration`; returning True stops.
+
+    Returns:
+        A plan; look at `status` before using it, and at `message` when it is not CONVERGED.
+
+    Raises:
+        TypeError: if `problem` lacks a required member.
+        ValueError: for an option or a problem's function out of range, naming it; for a drift
+            that is not affine in the control, or a diffusion that depends on noisy states.
+    """
+    began = time.perf_counter()
+    if shooting and method == "auto":
+        method = "convex"
+    options = Options(
+        variance_weight=variance_weight,
+        solver=solver,
+        method=method,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        trust_region=trust_region,
+        linearization=linearization,
+        terminal_tolerance=terminal_tolerance,
+        integrator=integrator,
+        callback=callback,
+    )
+    check_count("starts", starts)
+    check_choice("cold_start", cold_start, ("auto", "always", "never"))
+    if starts > 1 and guess is not None:
+        raise ValueError("starts > 1 and guess exclude each other: starts makes its own guesses")
+    model = model_of(problem)
+    if integrator != model.integrator:
+        model = dataclasses.replace(model, integrator=integrator)
+    if free_final_time:
+        check_number("time_weight", time_weight)
+        bounds = checked_bounds(model, final_time_bounds)
+    x, u = model.guess() if guess is None else given_guess(model, guess)
+    checks.check_once(model, x, u)
+    if check_derivatives:
+        checks.check_derivatives(model, x, u)
+    record: dict[str, Any] = {
+        **options.as_dict(),
+        "starts": int(starts),
+        "cold_start": cold_start,
+        "free_first": free_first,
+        "shooting": bool(shooting),
+        "free_final_time": bool(free_final_time),
+        "time_weight": float(time_weight) if free_final_time else None,
+    }
+    more: dict[str, Any] = {}
+
+    def run(x: Array, u: Array, *, own: bool = False) -> Outcome:
+        first = own and method != "convex" if free_first is None else free_first
+        if shooting:
+            found, more["shot"] = solve_shooting(model, options, x, u, free_first=first)
+            return found
+        return solve(model, options, x, u, free_first=first)
+
+    if starts > 1:
+        x, found, more["alternatives"] = multistart(model, options, starts)
+        if shooting:
+            found = run(found.x, found.u)
+    elif guess is None:
+        found = run(x, u, own=True)
+    elif cold_start == "never":
+        found = run(x, u)
+    else:
+        trusted = isinstance(guess, Plan) and guess.status.ok and cold_start == "auto"
+        x, found = run_guarded(model, options, run, (x, u), trusted=trusted)
+    if free_final_time:
+        model, found, more["time_search"] = search_time(
+            model, options, found, time_weight=float(time_weight), bounds=bounds
+        )
+        problem = reposed(problem, times=model.times)
+    return build(
+        found,
+        model,
+        problem,
+        guess=x,
+        options=record,
+        seconds=time.perf_counter() - began,
+        **more,
+    )
+
+

@@ -1,0 +1,394 @@
+"""What the method assumes is checked: noise-free diffusion, affine controls, right Jacobians."""
+
+import dataclasses
+import gc
+import weakref
+
+import numpy as np
+import pytest
+
+from slipcar.envs import Scenario
+from slipcar.planner import Status, plan
+from slipcar.planner.checks import check_assumptions, check_derivatives
+from slipcar.planner.problem import model_of
+from slipcar.planner.recent import Recent, is_immutable
+
+
+class Cart:
+    """A double integrator; members given to it replace its own."""
+
+    start = np.zeros(2)
+    times = np.linspace(0.0, 2.0, 21)
+    control_weight = np.eye(1)
+
+    def __init__(self, **members):
+        self.__dict__.update(members)
+
+    def drift(self, t, x, u):
+        return np.stack([x[..., 1], u[..., 0]], axis=-1)
+
+    def diffusion(self, t, x):
+        return np.full((*x.shape[:-1], 2, 1), 0.1)
+
+    def terminal(self, x):
+        return x - np.array([1.0, 0.0])
+
+
+def refused(message, problem, **options):
+    with pytest.raises(ValueError, match=message):
+        plan(problem, **options)
+
+
+def noise(*rows):
+    """A diffusion (t, x) -> (..., n, d) from functions of x, row by row."""
+
+    def diffusion(t, x):
+        return np.stack(
+            [np.stack([entry(x) + 0.0 * x[..., 0] for entry in row], -1) for row in rows], -2
+        )
+
+    return diffusion
+
+
+class Chain(Cart):
+    """x0' = x1, x1' = x2, x2' = u: noise moves up the chain, never down."""
+
+    start = np.array([0.2, 0.1, 0.3])
+
+    def drift(self, t, x, u):
+        return np.stack([x[..., 1], x[..., 2], u[..., 0]], axis=-1)
+
+    def terminal(self, x):
+        return x[..., :2]
+
+
+ZERO, TENTH = (lambda x: 0.0), (lambda x: 0.1)
+
+
+@pytest.mark.parametrize(
+    ("problem", "message"),
+    [
+        # The state that is driven is the one σ depends on.
+        (
+            Cart(diffusion=noise([ZERO], [lambda x: 0.1 + x[..., 1]])),
+            r"diffusion\[1, 0\] depends on x\[1\].*noise → x\[1\]\).*deterministic",
+        ),
+        # It is reached through the drift: noise on the speed moves the position.
+        (
+            Cart(diffusion=noise([ZERO], [lambda x: np.sin(x[..., 0])])),
+            r"diffusion\[1, 0\] depends on x\[0\].*noise → x\[1\] → x\[0\]",
+        ),
+        # Along two links.
+        (
+            Chain(diffusion=noise([lambda x: x[..., 0]], [ZERO], [TENTH])),
+            r"depends on x\[0\].*noise → x\[0\]",
+        ),
+        (
+            Chain(diffusion=noise([ZERO, ZERO], [ZERO, ZERO], [TENTH, lambda x: x[..., 0] ** 2])),
+            r"diffusion\[2, 1\] depends on x\[0\].*noise → x\[2\] → x\[1\] → x\[0\]",
+        ),
+        # The car that slips, were its heading to matter: v ω (1 + θ).
+        (
+            Cart(
+                start=np.full(3, 0.3),
+                drift=lambda t, x, u: np.stack([x[..., 1], u[..., 0], x[..., 1]], -1),
+                terminal=lambda x: x[..., :2],
+                diffusion=noise([lambda x: x[..., 1] * (1 + x[..., 2])], [ZERO], [TENTH]),
+            ),
+            r"diffusion\[0, 0\] depends on x\[2\]",
+        ),
+    ],
+)
+def test_a_diffusion_of_noisy_states_is_refused_with_the_path_of_the_noise(problem, message):
+    refused(message, problem)
+    with pytest.raises(ValueError, match="nominal path"):
+        plan(problem, variance_weight=0.0)
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        Cart(),
+        Cart(diffusion=noise([lambda x: x[..., 1]], [ZERO])),
+        Chain(diffusion=noise([lambda x: x[..., 1] * x[..., 2]], [ZERO], [ZERO])),
+        Chain(diffusion=noise([lambda x: 1.0 + x[..., 2]], [lambda x: x[..., 2]], [ZERO])),
+        Chain(diffusion=noise([ZERO], [ZERO], [ZERO])),
+        Chain(diffusion=lambda t, x: np.ones((*x.shape[:-1], 3, 1)) * np.sin(t)[..., None, None]),
+    ],
+)
+def test_a_diffusion_of_noise_free_states_and_time_is_not(problem):
+    check_assumptions(model_of(problem), *model_of(problem).guess())
+    assert plan(problem).status is Status.CONVERGED
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_the_verdict_does_not_depend_on_units(scale):
+    good = Cart(diffusion=noise([lambda x: scale * x[..., 1]], [ZERO]))
+    bad = Cart(diffusion=noise([lambda x: scale * x[..., 0]], [ZERO]))
+    check_assumptions(model_of(good), *model_of(good).guess())
+    with pytest.raises(ValueError, match="depends on"):
+        check_assumptions(model_of(bad), *model_of(bad).guess())
+
+
+@pytest.mark.parametrize("name", Scenario.names())
+def test_the_car_that_slips_is_accepted(name):
+    model = model_of(Scenario.named(name))
+    check_assumptions(model, *model.guess())
+    check_derivatives(model, *model.guess())
+
+
+@pytest.mark.parametrize(
+    "drift",
+    [
+        lambda t, x, u: np.stack([x[..., 1], u[..., 0] ** 2], -1),
+        lambda t, x, u: np.stack([x[..., 1], u[..., 0] + 1e-3 * u[..., 0] ** 3], -1),
+        lambda t, x, u: np.stack([x[..., 1], np.sin(u[..., 0])], -1),
+        lambda t, x, u: np.stack([x[..., 1], u[..., 0] * (1.0 + x[..., 1] * u[..., 0])], -1),
+    ],
+)
+def test_a_drift_that_bends_with_the_control_is_refused(drift):
+    refused(r"drift must be affine in the control.*component 1 is not", Cart(drift=drift))
+
+
+def test_a_product_of_two_controls_is_not_affine():
+    def drift(t, x, u):
+        return np.stack([u[..., 0] * u[..., 1], u[..., 0]], -1)
+
+    refused("component 0 is not", Cart(drift=drift, control_weight=np.eye(2)))
+
+
+def test_controls_times_functions_of_state_and_time_are_affine():
+    def drift(t, x, u):
+        return np.stack([x[..., 1], 1.0 + np.exp(x[..., 0]) * (2.0 + np.sin(t)) * u[..., 0]], -1)
+
+    assert plan(Cart(drift=drift), variance_weight=0.0).status is Status.CONVERGED
+
+
+class Spring(Cart):
+    """With every function a problem may have, all analytic."""
+
+    penalty_weight = np.array([2.0])
+
+    def drift(self, t, x, u):
+        return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1)
+
+    def penalty(self, t, x):
+        return x[..., 1:] ** 2 - 0.3
+
+    def state_cost(self, t, x):
+        return x[..., 0] ** 4
+
+    def control_cost(self, t, x):
+        return np.cos(x[..., 1:])
+
+
+def test_right_derivatives_pass():
+    assert plan(Spring(), check_derivatives=True).status is Status.CONVERGED
+
+
+def wrong(shape, entry, value):
+    def jacobian(*arguments):
+        out = np.zeros((*arguments[-1].shape[:-1], *shape))
+        out[(..., *entry)] = value
+        return out
+
+    return jacobian
+
+
+def drift_jacobian(t, x, u):
+    A, B = np.zeros((*x.shape, 2)), np.zeros((*x.shape, 1))
+    A[..., 0, 1] = 1.0
+    A[..., 1, 0] = np.cos(x[..., 0])  # the sign is wrong
+    B[..., 1, 0] = 1.0
+    return A, B
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        (
+            {"drift_jacobian": drift_jacobian},
+            r"drift_jacobian\[0\]\[1, 0\] \(your function\) is .* but differences give -",
+        ),
+        (
+            {"diffusion_jacobian": wrong((2, 1, 2), (0, 0, 1), 1.0)},
+            r"diffusion_jacobian\[0, 0, 1\] \(your function\) is 1 .* give 0",
+        ),
+        ({"penalty_jacobian": wrong((1, 2), (0, 0), 1.0)}, r"penalty_jacobian\[0, 0\]"),
+        ({"terminal_jacobian": wrong((2, 2), (0, 0), 1.0)}, r"terminal_jacobian\[1, 1\] .* is 0 "),
+        (
+            {"state_cost_derivatives": lambda t, x: (4.0 * x**3, np.zeros((*x.shape, 2)))},
+            r"state_cost_derivatives\[0\]\[1\]",
+        ),
+        ({"control_cost_jacobian": wrong((1, 2), (0, 0), 0.5)}, r"control_cost_jacobian\[0, 0\]"),
+        # Not analytic: the complex step takes conj and abs for what they are not.
+        (
+            {"state_cost": lambda t, x: (x[..., 0] * np.conj(x[..., 0])).real + 0.0 * x[..., 0]},
+            r"state_cost_derivatives\[0\]\[0\] \(by complex step\).*is the function analytic",
+        ),
+        (
+            {"penalty": lambda t, x: x[..., :1] * np.abs(x[..., :1] + 0.3)},
+            r"penalty_jacobian\[0, 0\] \(by complex step\)",
+        ),
+        (
+            {"terminal": lambda x: np.stack([np.conj(x[..., 0]), x[..., 1]], -1)},
+            r"terminal_jacobian\[0, 0\] \(by complex step\) is -1 .* give 1",
+        ),
+    ],
+)  # fmt: skip
+def test_wrong_derivatives_are_named_on_request(members, message):
+    refused(message, Spring(**members), check_derivatives=True)
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        (
+            {"drift": lambda t, x, u: np.zeros((2, 2)) + u[:2]},
+            r"drift.*must have shape \(2,\) for one point, not \(2, 2\)",
+        ),
+        ({"terminal": lambda x: np.zeros((2, 1))}, r"terminal\(x\) must have shape|\(16, 1\)"),
+        (
+            {"penalty": lambda t, x: np.zeros((2, 1)), "penalty_weight": np.ones(1)},
+            r"penalty\(t, x\) must have shape \(16, 1\) for 16 points, not \(2, 1\)",
+        ),
+        (
+            {
+                "diffusion": lambda t, x: np.full((len(x), 2, min(len(x), 3)), 0.1),
+                "diffusion_jacobian": lambda t, x: np.zeros((len(x), 2, 2, 2)),
+            },
+            r"diffusion_jacobian\(t, x\) must have shape \(16, 2, 3, 2\)",
+        ),
+    ],
+)
+def test_shapes_that_change_with_the_batch(members, message):
+    with pytest.raises(ValueError, match=message):
+        plan(Cart(**members))
+
+
+def test_points_where_the_drift_is_undefined_are_no_reason_to_refuse():
+    # √x has no value left of zero, where a random point may fall.
+    def drift(t, x, u):
+        with np.errstate(invalid="ignore"):
+            return np.stack([x[..., 1], u[..., 0] + np.sqrt(x[..., 0] + 0.02)], axis=-1)
+
+    # √ is not smooth at the start's left; the plan moves right.
+    assert plan(Cart(drift=drift), variance_weight=0.0).status is Status.CONVERGED
+
+
+def test_what_is_out_of_reach_is_named():
+    p = plan(Cart(control_bounds=np.array([0.9])), variance_weight=0.0)
+    assert p.status is Status.INFEASIBLE
+    assert "out of reach" in p.message
+    for j, value in enumerate(p.problem.terminal(p.mean[-1])):
+        assert (f"g[{j}] = {value:.4g}" in p.message) == (abs(value) > 1e-5)
+    both = Cart(terminal=lambda x: np.stack([x[..., 0] - 1.0, x[..., 0] - 3.0, x[..., 1]], -1))
+    q = plan(both, variance_weight=0.0)
+    assert q.status is Status.INFEASIBLE
+    assert "g[2]" not in q.message  # the speed is no trouble
+    assert "g[0]" in q.message or "g[1]" in q.message
+
+
+def test_functions_that_are_not_finite_along_the_guess_are_named():
+    x = np.linspace([0.0, 0.0], [3.0, 0.0], 21)
+    log = Cart(penalty=lambda t, x: np.log(2.0 - x[..., :1]), penalty_weight=np.ones(1))
+    with np.errstate(all="ignore"):
+        refused("penalty is not finite along the guess", log, guess=(x, np.zeros((20, 1))))
+
+
+# ------------------------------------------------------------------------------- checked once
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    """An immutable problem that counts how often its drift is called."""
+
+    counter: tuple = ()
+    target: float = 1.0
+
+    @property
+    def start(self):
+        return np.zeros(2)
+
+    @property
+    def times(self):
+        return np.linspace(0.0, 2.0, 21)
+
+    @property
+    def control_weight(self):
+        return np.eye(1)
+
+    def drift(self, t, x, u):
+        return np.stack([x[..., 1], u[..., 0]], axis=-1)
+
+    def diffusion(self, t, x):
+        return np.full((*x.shape[:-1], 2, 1), 0.1)
+
+    def terminal(self, x):
+        return x - np.array([self.target, 0.0])
+
+
+def test_an_immutable_problem_is_completed_once():
+    problem = Fixed()
+    assert model_of(problem) is model_of(problem)
+    assert model_of(Fixed()) is not model_of(problem)  # equal, but another object
+    assert model_of(Cart()) is not model_of(Cart())
+    scenario = Scenario.named("paper")
+    assert model_of(scenario) is model_of(scenario)
+
+
+def test_a_mutable_problem_is_looked_at_again():
+    cart = Cart()
+    assert plan(cart).status is Status.CONVERGED
+    cart.drift = lambda t, x, u: np.stack([x[..., 1], u[..., 0] ** 2], -1)
+    refused("affine", cart)
+    cart = Cart()
+    model_of(cart)
+    cart.start = np.array([0.5, 0.0])
+    np.testing.assert_array_equal(plan(cart).mean[0], cart.start)
+
+
+def test_what_counts_as_immutable():
+    frozen = np.zeros(3)
+    frozen.setflags(write=False)
+    view = np.zeros(3)[:2]
+    view.setflags(write=False)
+
+    @dataclasses.dataclass(frozen=True, eq=False)
+    class Holder:
+        value: object
+
+    @dataclasses.dataclass
+    class Open:
+        value: object
+
+    for value in (1, 2.5, "text", None, True, frozen, (1, (2.0, frozen)), np.float64(3.0)):
+        assert is_immutable(Holder(value))
+    for value in (np.zeros(3), [1], {"a": 1}, view, (np.zeros(2),), Cart()):
+        assert not is_immutable(Holder(value))
+    assert not is_immutable(Open(1))
+    assert not is_immutable(Cart())
+
+
+def test_few_problems_are_remembered_and_none_is_confused():
+    recent, problems = Recent(), [Fixed(target=float(i)) for i in range(200)]
+    for i, problem in enumerate(problems):
+        recent.keep(problem, i)
+    known = [recent.get(problem) for problem in problems]
+    assert known[:100] == [None] * 100
+    assert known[-50:] == list(range(150, 200))
+    assert recent.get(Fixed(target=199.0)) is None
+    recent.keep(cart := Cart(), 1)
+    assert recent.get(cart) is None
+
+
+def test_forgotten_problems_are_freed():
+    recent = Recent()
+    first = Fixed()
+    gone = weakref.ref(first)
+    recent.keep(first, "model")
+    del first
+    for i in range(100):
+        recent.keep(Fixed(target=float(i)), i)
+    gc.collect()
+    assert gone() is None
