@@ -100,9 +100,7 @@ def plan_batch(
     record = {**chosen.as_dict(), "free_first": free_first}
     share = (time.perf_counter() - began) / max(len(tasks), 1)
     return [
-        build(
-            outcome, task.model, problem, guess=task.x, options=record, seconds=share
-        )
+        build(outcome, task.model, problem, guess=task.x, options=record, seconds=share)
         for task, problem, outcome in zip(tasks, posed, outcomes, strict=True)
     ]
 
@@ -213,5 +211,3 @@ def _completed(problem: Problem, options: Options) -> Model:
     if options.integrator != model.integrator:
         model = dataclasses.replace(model, integrator=options.integrator)
     return model
-
-

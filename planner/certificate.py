@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-#: Multipliers are normalised to length one; a |p⁰| below this is as good as none.
-_VANISHING = 1e-8
+#: Multipliers are normalised to length one; a |p⁰| below this is as good as none. (Early iterates
+#: of hard worlds are far from anything feasible, and have multipliers of 10⁸ for a cost of one.)
+_VANISHING = 1e-14
 #: A sub-problem that lacks more than this of its terminal condition, per unit of the state, was
 #: solved with that condition relaxed: its multiplier is the limit ρ, and normal by construction.
 _RELAXED = 1e-6

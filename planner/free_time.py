@@ -102,8 +102,10 @@ def free_final_time(
         a root of the slope or against a bound), and every horizon tried.
     """
     model, best, steps, settled = _search(model, options, found, time_weight, bounds)
-    history = tuple(row for step in steps for row in step[1])
-    best = dataclasses.replace(best, iterations=len(history), history=history)
+    # Horizons that were not taken are told of in `steps` alone.
+    history = tuple(row for step, rows in steps if step.accepted for row in rows)
+    tried = sum(step.iterations for step, _ in steps)
+    best = dataclasses.replace(best, iterations=tried, history=history)
     if best.status.ok and not settled:
         best = dataclasses.replace(best, status=Status.MAX_ITERATIONS).said(
             f"the final time did not settle within {len(steps)} plans"
@@ -143,7 +145,7 @@ def _search(
     curvature = 12.0 * max(best.objective - time_weight * T, 0.0) / T**2
     for _ in range(_PLANS):
         if not best.outcome.status.ok:
-            if best.T >= high:
+            if high <= best.T:
                 return best.model, best.outcome, steps, False
             # Too short a horizon is the usual reason.
             best = at(min(best.T * 1.5, high), found.x, found.u)
@@ -173,9 +175,7 @@ def _search(
     return best.model, best.outcome, steps, False
 
 
-def _step(
-    point: _Point, radius: float, accepted: bool
-) -> tuple[TimeStep, Sequence[Iteration]]:
+def _step(point: _Point, radius: float, accepted: bool) -> tuple[TimeStep, Sequence[Iteration]]:
     row = TimeStep(
         final_time=point.T,
         objective=point.objective,

@@ -31,9 +31,7 @@ from slipcar.planner.trust_region import TRUST_REGIONS
 Array = np.ndarray
 
 
-def solve(
-    model: Model, options: Options, x: Array, u: Array, *, free_first: bool
-) -> Outcome:
+def solve(model: Model, options: Options, x: Array, u: Array, *, free_first: bool) -> Outcome:
     """Plan from one guess, states (N, n) and controls (K, m); penalties left out first or not.
 
     Raises:
@@ -90,9 +88,7 @@ def known_functions(model: Model, x: Array, u: Array) -> Functions | None:
     return functions if functions.kernels else None
 
 
-def _convex(
-    model: Model, options: Options, x: Array, u: Array, free_first: bool
-) -> Outcome:
+def _convex(model: Model, options: Options, x: Array, u: Array, free_first: bool) -> Outcome:
     given = options.solver
     trust = TRUST_REGIONS[options.trust_region or "adaptive"]
     before: tuple[Iteration, ...] = ()

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem import Problem
-from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.records import Alternative, TimeStep
 from slipcar.planner.status import Status
 
@@ -108,8 +108,8 @@ def _history_from(arrays: dict[str, Array]) -> Sequence[Iteration]:
     columns = _strip(arrays, "history.")
     if not columns:
         return ()
-    if set(columns) != {field.name for field in dataclasses.fields(Iteration)}:
-        raise KeyError("history")
+    if missing := {field.name for field in dataclasses.fields(Iteration)} - set(columns):
+        raise KeyError(f"history: {sorted(missing)}")
     return Columns(columns)
 
 

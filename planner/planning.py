@@ -131,9 +131,9 @@ def plan(
         check_number("time_weight", time_weight)
         bounds = checked_bounds(model, final_time_bounds)
     x, u = model.guess() if guess is None else given_guess(model, guess)
-    checks.check_once(model, x, u)
-    if check_derivatives:
+    if check_derivatives:  # before the rest, which relies on them
         checks.check_derivatives(model, x, u)
+    checks.check_once(model, x, u)
     record: dict[str, Any] = {
         **options.as_dict(),
         "starts": int(starts),
@@ -177,5 +177,3 @@ def plan(
         seconds=time.perf_counter() - began,
         **more,
     )
-
-

@@ -9,8 +9,11 @@
 and the mean is, to first order, what the controls do: over long horizons and for cheap controls
 the step alone says little about the path.
 
-Steps are long at first: they find a way round the obstacles. Should the iteration settle where the
-terminal condition cannot be met, it is run once more with short steps from the beginning.
+Steps are long at first: they find a way round the obstacles. The linearisation is then crude, and
+limits on the controls would make it saturate them, up to paths from which no way leads on: they
+act from when steps have become short. Should the iteration settle all the same where the terminal
+condition cannot be met, it is run once more, with limits and short steps from the beginning. At
+the end, where convergence is linear, steps are lengthened or combined (:mod:`.acceleration`).
 """
 
 from __future__ import annotations
@@ -21,8 +24,9 @@ import time
 import numpy as np
 
 from slipcar.planner import moments
+from slipcar.planner.acceleration import Acceleration
 from slipcar.planner.backends import Solution, Solver
-from slipcar.planner.convexify import Subproblem, convexify, linearize
+from slipcar.planner.convexify import Linearization, Subproblem, convexify, linearize
 from slipcar.planner.feasibility import (
     FEASIBILITY,
     inconsistency,
@@ -30,8 +34,8 @@ from slipcar.planner.feasibility import (
     terminal_force,
     what_lacks,
 )
-from slipcar.planner.merit import Iterate, iterate_at, merit, model_merit, variance_of
 from slipcar.planner.history import Iteration
+from slipcar.planner.merit import Iterate, iterate_at, lagrangian, merit, model_merit, variance_of
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem import Model
@@ -46,6 +50,8 @@ _FIRST_RHO, _RAISES, _WORTHWHILE = 1e3, 3, 0.01
 #: A converged plan leaves no more than this between its mean and the path that its controls
 #: lead to, per unit of the state.
 _CONSISTENCY = 1e-4
+#: Control bounds act once ∫ ‖u_{k+1} − u_k‖² dt is this small beside ∫ ‖u_{k+1}‖² dt.
+_SHORT = 0.03
 
 
 def iterate(
@@ -92,7 +98,14 @@ def _attempt(
     rho, raises, lacked = first_rho, 0, np.inf
     last_step, tau = np.inf, options.terminal_tolerance
 
+    acceleration = Acceleration(model.dt)
+    # While steps are long: see the module's docstring.
+    relaxed = _relaxed(model) if trust.bold and (model.bounded or model.radius < np.inf) else None
+
     def outcome(status: Status, message: str = "") -> Outcome:
+        nonlocal at
+        if not status.ok and not np.array_equal(inside := model.admissible(at.lin.u), at.lin.u):
+            at = iterate_at(model, options.variance_weight, at.lin.x, inside)
         lin = at.lin
         return Outcome(
             status=status,
@@ -116,10 +129,11 @@ def _attempt(
     composite = options.linearization == "composite"
     for _ in range(options.max_iterations):
         clock = time.perf_counter()
-        sub, found, radius = _solve(model, solver, trust, options, at, rho)
+        sub, found, radius = _solve(relaxed or model, solver, trust, options, at, rho)
         solved = time.perf_counter()
         if not found.found:
             # A shorter step is an easier sub-problem; a schedule that knows none gives up.
+            relaxed = None
             trust.judge(Step(np.nan, 0.0, -np.inf, np.inf, np.inf))
             if trust.collapsed:
                 return outcome(Status.SOLVER_FAILED, found.message)
@@ -132,8 +146,28 @@ def _attempt(
         step = float(np.vdot(model.dt[:, None] * found.e, found.e))
         new = iterate_at(model, options.variance_weight, new_x, at.lin.u + found.e)
         after = merit(new, found, tau, rho)
+        accelerated = False
+        far = step + last_step > options.tolerance
+        eligible = far and trust.accelerates and relaxed is None and used == 0.0
+        if eligible and acceleration.observe(at.lin.u, new_x, found.e):
+            plain = lagrangian(new, found, tau)
+            here = lagrangian(at, found, tau)
+            ratio = (here - plain) / max(predicted - before + here, 1e-300)
+            for x, u in acceleration.propose(at.lin.x, at.lin.u, ratio):
+                other = iterate_at(model, options.variance_weight, x, model.admissible(u))
+                value = merit(other, found, tau, rho)
+                accelerated = (
+                    other.lin.finite
+                    and (trust.bold or value < before)
+                    and lagrangian(other, found, tau) < plain
+                )
+                if accelerated:
+                    new, after = other, value
+                    break
         actual = before - after if new.lin.finite and np.isfinite(after) else -np.inf
         accepted = trust.judge(Step(radius, max(predicted, 0.0), actual, after, before))
+        if not accepted or trust.multiplier > 0.0:
+            acceleration.forget()
         done = time.perf_counter()
         history.append(
             Iteration(
@@ -142,7 +176,9 @@ def _attempt(
                 effort=new.lin.effort,
                 penalty=new.lin.penalty,
                 running=new.lin.running,
-                variance=np.nan if new.variance is None else new.variance_value() / options.variance_weight,
+                variance=np.nan
+                if new.variance is None
+                else new.variance_value() / options.variance_weight,
                 merit=after,
                 predicted=predicted,
                 actual=actual,
@@ -160,6 +196,10 @@ def _attempt(
             )
         )
         linearize_seconds = 0.0
+        if relaxed is not None and not (accepted and _still_bold(model, trust, new.lin, step)):
+            relaxed = None
+            if not np.array_equal(model.admissible(new.lin.u), new.lin.u):
+                step = np.inf  # by steps that do not count: they paid no heed to the bounds
         stop = options.callback is not None and options.callback(history[-1])
         if accepted:
             at, adjoint, terminal, multiplier = new, found.adjoint, found.terminal, used
@@ -176,6 +216,7 @@ def _attempt(
                     return outcome(Status.CONVERGED)
                 if raises == _RAISES or lacking > (1.0 - _WORTHWHILE) * lacked:
                     return outcome(Status.INFEASIBLE, what_lacks(at.lin, tau, size))
+                acceleration.forget()
                 rho, raises, lacked, step = 10.0 * rho, raises + 1, lacking, np.inf
             last_step = step
         elif trust.collapsed:
@@ -183,6 +224,18 @@ def _attempt(
         if stop:
             return outcome(Status.STOPPED)
     return outcome(Status.MAX_ITERATIONS)
+
+
+def _relaxed(model: Model) -> Model:
+    """The problem without limits on its controls."""
+    inf = np.full(model.control_dim, np.inf)
+    return dataclasses.replace(model, lower=-inf, upper=inf, radius=np.inf)
+
+
+def _still_bold(model: Model, trust: TrustRegion, at: Linearization, step: float) -> bool:
+    """Whether the next step may still pass the control bounds."""
+    size = float(np.vdot(model.dt[:, None] * at.u, at.u))
+    return trust.bold and step > _SHORT * size
 
 
 def _solve(

@@ -12,8 +12,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Hashable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -69,7 +68,9 @@ def initial_guesses(model: Model, count: int) -> list[Guess]:
     for label, states, controls in _others(model, x, u, int(count)):
         if len(found) >= count:
             break
-        found.append(Guess(label, *checked_trajectory(model, states, controls)))
+        guess = Guess(label, *checked_trajectory(model, states, controls))
+        if not np.array_equal(guess.states, x):  # the own one again
+            found.append(guess)
     return found[:count]
 
 
@@ -121,14 +122,16 @@ def _others(model: Model, x: Array, u: Array, count: int) -> Iterator[tuple[str,
 
 
 def _bumps(model: Model, x: Array) -> Iterator[Array]:
-    """Endless smooth perturbations of a path (N, n), of its own size, ends kept."""
+    """Endless smooth perturbations of a path (N, n), of its own size, ends kept; each both ways."""
     rng = np.random.default_rng(0)
     spread = np.ptp(x, axis=0)
     size = np.where(spread > 0.0, spread, np.maximum(np.max(np.abs(x), axis=0), 1.0))
     s = (model.times - model.times[0]) / (model.times[-1] - model.times[0])
     waves = np.sin(np.pi * np.outer(s, [1.0, 2.0]))
     while True:
-        yield x + waves @ rng.normal(0.0, _BUMP, (2, len(size))) * size
+        bump = waves @ rng.normal(0.0, _BUMP, (2, len(size))) * size
+        yield x + bump
+        yield x - bump
 
 
 def _finite_along(model: Model, x: Array, u: Array) -> bool:

@@ -161,7 +161,7 @@ class Expression:
     def __float__(self) -> float:
         return self._refuse("a conversion to float")
 
-    __int__ = __index__ = __complex__ = __float__  # type: ignore[assignment]
+    __int__ = __index__ = __complex__ = __float__
 
     def __hash__(self) -> int:
         return self.index
@@ -172,7 +172,7 @@ class Expression:
     def __deepcopy__(self, memo: Any) -> Expression:
         return self
 
-    # -------------------------------------------------------------------- functions, by NumPy's names
+    # ---------------------------------------------------------- functions, by NumPy's names
 
     def __getattr__(self, name: str) -> Callable[[], Expression]:
         if name in FUNCTIONS:

@@ -108,9 +108,7 @@ def generate(A: np.ndarray, B: np.ndarray, t: int) -> Recursion | None:
 def _packed(V: np.ndarray, n: int, zero: Expression) -> list[Expression]:
     """Upper triangle, row by row; the constant, entry (n, n), is of no use and left at zero."""
     size = len(V)
-    return [
-        zero if i == j == n else V[i, j] for i in range(size) for j in range(i, size)
-    ]
+    return [zero if i == j == n else V[i, j] for i in range(size) for j in range(i, size)]
 
 
 def _unpacked(graph: Graph, name: str, size: int, n: int) -> np.ndarray:

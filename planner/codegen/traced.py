@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -115,7 +116,7 @@ def _trace(model: Model, native: bool) -> Kernels:
     make = _native() if native else vectorize_kernel
     n, m, p = model.state_dim, model.control_dim, len(model.weight)
     graph = Graph()
-    problem = model.problem
+    problem: Any = model.problem
     parameters = parameters_of(problem)
     symbols, used = {}, 0
     row = graph.inputs("parameters", (max(1, sum(v.size for v in parameters.values())),))
@@ -140,11 +141,12 @@ def _trace(model: Model, native: bool) -> Kernels:
     sigma = array(problem.diffusion(t, x))
     c = np.empty(0, dtype=object) if p == 0 else array(problem.penalty(t, x))
     g = array(problem.terminal(x))
-    H, ell = zero, np.full(m, zero)
+    H: Any = zero
+    ell = np.full(m, zero)
     if model.state_cost is not None:
-        H = array(problem.state_cost(t, x))[()]  # type: ignore[attr-defined]
+        H = array(problem.state_cost(t, x))[()]
     if model.control_cost is not None:
-        ell = array(problem.control_cost(t, x))  # type: ignore[attr-defined]
+        ell = array(problem.control_cost(t, x))
     one_x, one_u = x[0], u[0]
     H_x = jacobian(np.array([H], dtype=object), one_x)[0]
 
@@ -153,7 +155,9 @@ def _trace(model: Model, native: bool) -> Kernels:
     at_stage = {"t": 1, "dt": 1, "x": n, "u": m}
 
     def kernel(inputs: dict[str, int], **outputs: Any) -> Kernel:
-        rows = {name: list(np.ravel(value)) for name, value in outputs.items()}
+        rows: dict[str, Sequence[Expression]] = {
+            name: list(np.ravel(value)) for name, value in outputs.items()
+        }
         return make({**inputs, **common}, rows, shared)
 
     adjoint = graph.inputs("adjoint", (n,))

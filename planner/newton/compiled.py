@@ -215,9 +215,7 @@ def _consistent(at, tuning):
     """`loop._consistent`."""
     x, values = at[14], at[19]
     size = 1.0 + 2.0 * _half_largest(x)
-    return (
-        values[5] <= tuning.feasibility * size and inconsistency(at) <= tuning.consistency * size
-    )
+    return values[5] <= tuning.feasibility * size and inconsistency(at) <= tuning.consistency * size
 
 
 @numba.njit(error_model="numpy")
@@ -264,8 +262,10 @@ def _iterate(
             settling < tuning.released * at[19][0] or iteration >= tuning.released_steps
         ):
             released, hinges, last = False, weight, np.inf
-        newton = not released and tried > 0 and (
-            iteration >= tuning.free_steps or settling < tuning.settled * at[19][0]
+        newton = (
+            not released
+            and tried > 0
+            and (iteration >= tuning.free_steps or settling < tuning.settled * at[19][0])
         )
         fallback = rejected >= tuning.rejections
         curved = newton and not fallback
@@ -310,9 +310,7 @@ def _iterate(
             break
         if not same:
             _respond(A, B, f, u, lower, upper, de, ee)
-        model, step, radius = _model_cost(
-            dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee
-        )
+        model, step, radius = _model_cost(dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee)
         price, dear = _half_largest(adjoint), _half_largest(nu)
         before, gap, miss = lagrangian(at, adjoint, nu, w, dt, at[20])
         gained, lacking = before - model, price * gap + dear * miss

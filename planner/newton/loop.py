@@ -129,7 +129,11 @@ def iterate(
             settling < TUNING.released * at.lin.effort or iteration >= TUNING.released_steps
         ):
             released, last = False, np.inf
-        newton = not released and bool(history) and (iteration >= TUNING.free_steps or settling < TUNING.settled * at.lin.effort)
+        newton = (
+            not released
+            and bool(history)
+            and (iteration >= TUNING.free_steps or settling < TUNING.settled * at.lin.effort)
+        )
         fallback = rejected >= TUNING.rejections
         curved = newton and not fallback
         quadratic = _quadratic(model, functions, at, adjoint, terminal, curved)
@@ -243,6 +247,9 @@ def evaluate(model: Model, functions: Functions, w: float, x: Array, u: Array) -
     H_x, H_xx = node["H_x"], node["H_xx"].reshape(K, n, n)
     c = node["c"]
     column = dt[:, None]
+    q_running = column * H_x
+    if model.control_cost is not None:
+        q_running[:-1] += column[1:] * np.einsum("kmn,km->kn", d_ell[1:], u[1:])
     lin = Linearization(
         x=x,
         u=u,
@@ -257,11 +264,9 @@ def evaluate(model: Model, functions: Functions, w: float, x: Array, u: Array) -
         effort=float(np.vdot(column * u, u @ model.R)),
         penalty=float(np.vdot(column * model.weight, np.maximum(c, 0.0) ** 2)),
         running=float(np.vdot(column * ell, u) + np.vdot(dt, node["H"][:, 0])),
-        q_running=column * H_x,
+        q_running=q_running,
         r_running=column * ell,
     )
-    if model.control_cost is not None:
-        lin.q_running[:-1] += column[1:] * np.einsum("kmn,km->kn", d_ell[1:], u[1:])
     variance, weights = None, None
     if w > 0.0:
         d_sigma = stage["d_sigma"].reshape(*sigma.shape, n)
@@ -282,7 +287,8 @@ def _quadratic(
     """The quadratic model at an iterate, hinges and shift left out."""
     lin, dt = at.lin, model.dt
     (K, m), n = lin.u.shape, lin.x.shape[1]
-    assert lin.q_running is not None and lin.r_running is not None
+    assert lin.q_running is not None
+    assert lin.r_running is not None
     q = lin.q_running.copy()
     Q = dt[:, None, None] * at.H_xx
     R = 2.0 * dt[:, None, None] * model.R
@@ -290,9 +296,7 @@ def _quadratic(
     S = np.zeros((K, m, n))
     if curved:
         t = model.times
-        second = functions.stage_hessian(
-            t=t[:-1], dt=dt, x=lin.x[:-1], u=lin.u, adjoint=adjoint
-        )
+        second = functions.stage_hessian(t=t[:-1], dt=dt, x=lin.x[:-1], u=lin.u, adjoint=adjoint)
         Q[:-1] += second["xx"].reshape(K, n, n)[1:]
         S = second["ux"].reshape(K, m, n)
         R += second["uu"].reshape(K, m, m)
@@ -319,7 +323,7 @@ def _solve(
     shift: float,
     kappa: float,
 ) -> tuple[LqSolution | None, tuple[Array, Array], int]:
-    """Solve the model with the hinges that are on, weighed; the active bounds; LQ problems solved."""
+    """Solve the model with the hinges that are on; the active bounds; LQ problems solved."""
     lin, dt = at.lin, model.dt
     h = 2.0 * dt[:, None] * weight * (lin.c > 0.0)
     Q = quadratic.Q + np.einsum("kp,kpi,kpj->kij", h, lin.C, lin.C)

@@ -1,6 +1,7 @@
 """The LQ problem of one iteration by a Riccati recursion, in NumPy.
 
-    minimise   Σ_{k=0}^{K-1} ½ e_kᵀR_k e_k + r_kᵀe_k + e_kᵀS_k d_k  +  Σ_{k=1}^{K} ½ d_kᵀQ_k d_k + q_kᵀd_k
+    minimise   Σ_{k=0}^{K-1} ½ e_kᵀR_k e_k + r_kᵀe_k + e_kᵀS_k d_k  +  Σ_{k=1}^{K} ½ d_kᵀQ_k d_k
+               + q_kᵀd_k
     s.t.       d_{k+1} = A_k d_k + B_k e_k + f_k,   d_0 = 0,   G d_K + g = 0
 
 With the multiplier ν of the terminal condition the cost to go is a quadratic form in

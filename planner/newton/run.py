@@ -196,7 +196,7 @@ def run(
     d = kernels.stage.outputs["sigma"] // n
 
     def copied(values: Any) -> Array:
-        """Contiguous, because kernels are handed addresses; writable, so that numba sees one type."""
+        """Contiguous, because kernels are handed addresses; writable: numba sees one type."""
         return np.array(values, dtype=np.float64, order="C")
 
     def stacked(name: str) -> Array:

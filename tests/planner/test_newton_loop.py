@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import itertools
 
 import numpy as np
 import pytest
@@ -90,9 +91,7 @@ def test_the_paper_case_has_the_references_answer(paper, reference, path):
     total = known["effort"] + known["obstacle_cost"]
     assert found.effort + found.penalty == pytest.approx(total, rel=1e-6)
     assert found.objective == pytest.approx(total, rel=1e-6)
-    np.testing.assert_allclose(
-        np.abs(found.terminal), known["terminal_multiplier_abs"], rtol=1e-3
-    )
+    np.testing.assert_allclose(np.abs(found.terminal), known["terminal_multiplier_abs"], rtol=1e-3)
     trace = np.einsum("k,kii", np.diff(paper.times), found.covariance[1:])
     assert trace == pytest.approx(known["covariance_trace_integral"], rel=1e-3)
 
@@ -117,6 +116,7 @@ def _errors_from_nearby(scenario, w):
         exact.x + 3e-3 * rng.normal(size=exact.x.shape),
         exact.u + 3e-3 * rng.normal(size=exact.u.shape),
     )
+    near[0][0] = model.start
     found = _solve(PATHS[-1], model, variance_weight=w, tolerance=1e-24, guess=near)
     assert all(h.accepted and h.trust_multiplier == 0.0 for h in found.history)
     size = np.linalg.norm(exact.u)
@@ -139,16 +139,16 @@ def test_with_a_variance_penalty_each_step_gains_a_decimal_digit_at_least(paper)
     # The penalty's weights are held in each model (:mod:`..moments`), so it is not quadratic.
     for scenario in [paper, *(Scenario.random(seed, turned=True) for seed in range(200, 204))]:
         errors = _errors_from_nearby(scenario, 1.0)
-        assert all(b < max(0.1 * a, 1e-14) for a, b in zip(errors[1:-1], errors[2:], strict=True))
+        assert all(b < max(0.1 * a, 1e-14) for a, b in itertools.pairwise(errors[1:]))
 
 
 def test_active_control_bounds_give_the_optimum_of_the_convex_sub_problems(paper):
     pytest.importorskip("cvxpy")
-    tight = paper.replace(control_bounds=(0.5, 1.1))
+    tight = paper.replace(control_bounds=(0.7, 1.3))
     model = model_of(tight)
     found = _all_agree(model, variance_weight=0.0, tolerance=1e-10)
     assert found.status is Status.CONVERGED
-    limit = np.array([0.5, 1.1])
+    limit = np.array([0.7, 1.3])
     on = np.abs(found.u) > limit - 1e-9
     assert (np.abs(found.u) <= limit).all()
     assert on.any(axis=0).all()
@@ -255,7 +255,7 @@ class Leak:
     times = np.linspace(0.0, 2.0, 15) ** 1.2
     control_weight = np.array([[0.7]])
     penalty_weight = np.array([3.0, 5.0])
-    control_bounds = np.array([[-1.5], [2.0]])
+    control_bounds = np.array([[-4.0], [2.0]])
 
     def drift(self, t, x, u):
         return -(x**3) / (1.0 + x * x) + u * (1.0 + 0.2 * np.sin(x)) + np.sin(t)[..., None]
@@ -297,6 +297,23 @@ def test_one_state_one_control_with_every_cost_converges_to_an_extremal(kind, in
         _extremal(model, found, w, 1e-6)
 
 
+@pytest.mark.parametrize("w", [0.0, 1.0])
+def test_code_that_cannot_be_traced_gives_the_same_plan(w):
+    class Untraceable(Leak):
+        def drift(self, t, x, u):
+            return np.where(np.isfinite(x), 1.0, 0.0) * super().drift(t, x, u)
+
+    model = model_of(Untraceable())
+    functions = functions_of(model, *model.guess(), native=NUMBA)
+    assert functions.kernels is None
+    options = Options(variance_weight=w, tolerance=1e-10)
+    found = loop.iterate(model, functions, options, *model.guess(), free_first=False)
+    known = _solve("numpy", model_of(Leak()), variance_weight=w, tolerance=1e-10)
+    assert found.status is known.status is Status.CONVERGED
+    assert len(found.history) == len(known.history)
+    np.testing.assert_allclose(found.u, known.u, atol=1e-9)
+
+
 def test_uneven_and_strided_arrays_are_read_as_they_are_meant(paper):
     """Kernels are handed addresses: what lies in memory otherwise must be copied first."""
 
@@ -305,7 +322,9 @@ def test_uneven_and_strided_arrays_are_read_as_they_are_meant(paper):
         control_weight = np.asfortranarray(Leak.control_weight)
 
     for path in PATHS:
-        one, other = (_solve(path, model_of(kind()), variance_weight=1.0) for kind in (Leak, Strided))
+        one, other = (
+            _solve(path, model_of(kind()), variance_weight=1.0) for kind in (Leak, Strided)
+        )
         np.testing.assert_array_equal(one.u, other.u)
     model = model_of(paper)
     x, u = model.guess()

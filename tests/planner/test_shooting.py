@@ -104,7 +104,7 @@ def near(p, start_within=START_WITHIN):
 
 @pytest.mark.parametrize("weight", [0.0, 1.0, 10.0])
 def test_convergence_is_quadratic(paper, weight):
-    p = plan(paper, variance_weight=weight, tolerance=1e-6)
+    p = plan(paper, variance_weight=weight, tolerance=1e-6, method="convex")
     pairs = []
     for k in range(3, 9):
         shot = shoot_from(p, k)
@@ -121,7 +121,7 @@ def test_convergence_is_quadratic(paper, weight):
 
 @pytest.mark.parametrize("weight", [0.0, 1.0, 10.0])
 def test_it_agrees_with_scp_run_to_the_end(paper, weight):
-    p = plan(paper, variance_weight=weight, tolerance=1e-22, max_iterations=200)
+    p = plan(paper, variance_weight=weight, tolerance=1e-22, max_iterations=200, method="convex")
     shot = shoot_from(p, 5)
     assert shot.converged
     np.testing.assert_allclose(shot.at.u, p.controls, atol=1e-8)
@@ -131,7 +131,7 @@ def test_it_agrees_with_scp_run_to_the_end(paper, weight):
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_every_later_iterate_leads_to_the_same_extremal(paper, weight):
-    p = plan(paper, variance_weight=weight, tolerance=1e-10)
+    p = plan(paper, variance_weight=weight, tolerance=1e-10, method="convex")
     ends = [shoot_from(p, k) for k in range(4, p.iterations)]
     assert all(shot.converged for shot in ends)
     for shot in ends[1:]:
@@ -142,7 +142,7 @@ def test_every_later_iterate_leads_to_the_same_extremal(paper, weight):
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_the_improved_plan_is_an_extremal_to_twelve_digits(paper, weight):
-    p = plan(paper, variance_weight=weight, max_iterations=6)
+    p = plan(paper, variance_weight=weight, max_iterations=6, method="convex")
     shot = shoot_from(p)
     q = improved(p, shot)
     assert q.status is Status.CONVERGED
@@ -157,7 +157,7 @@ def test_the_improved_plan_is_an_extremal_to_twelve_digits(paper, weight):
 
 
 def test_other_start_multipliers_lead_to_the_same_end(paper):
-    p = plan(paper, max_iterations=7)
+    p = plan(paper, max_iterations=7, method="convex")
     model = model_for(p)
     nu = -p.multipliers.terminal
     own = shoot(model, p.mean, p.controls, nu, adjoint=-p.multipliers.adjoint[1:])
@@ -291,7 +291,12 @@ def test_second_derivatives_in_closed_form():
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_random_worlds(weight):
     plans = [
-        plan(Scenario.random(seed, turned=True), variance_weight=weight, tolerance=1e-10)
+        plan(
+            Scenario.random(seed, turned=True),
+            variance_weight=weight,
+            tolerance=1e-10,
+            method="convex",
+        )
         for seed in range(40)
     ]
     settled = [p for p in plans if p.status is Status.CONVERGED]
