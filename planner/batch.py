@@ -15,7 +15,13 @@ import numpy as np
 
 from slipcar.planner import checks
 from slipcar.planner.build import build
-from slipcar.planner.method import driver, known_functions, second_chance, solve, uses_newton
+from slipcar.planner.method import (
+    compiled_functions,
+    driver,
+    second_chance,
+    solve,
+    uses_newton,
+)
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.options import Options, check_count
 from slipcar.planner.outcome import Outcome
@@ -63,8 +69,8 @@ def plan_batch(
         workers: threads; 0 takes one for each processor. The plans do not depend on it.
         history: keep the trajectories of every iteration, as `plan` does; large.
         **options: `variance_weight`, `method`, `solver`, `tolerance`, `max_iterations`,
-            `trust_region`, `linearization`, `terminal_tolerance`, `integrator`, `free_first` of
-            :func:`plan`.
+            `trust_region`, `linearization`, `terminal_tolerance`, `integrator`, `compiled`,
+            `free_first` of :func:`plan`.
 
     Returns:
         One plan for each, in order. Look at every `status`; `solve_time` is the batch's, shared
@@ -110,12 +116,12 @@ def solve_tasks(
 ) -> list[Outcome]:
     """Outcomes of all, in order: together where they can be compiled, else one by one."""
     found: list[Outcome | None] = [None] * len(tasks)
-    if driver() is not None and options.callback is None:
+    if driver() is not None or options.compiled:
         groups: dict[Any, list[tuple[int, Functions]]] = {}
         for i, task in enumerate(tasks):
             if not uses_newton(task.model, options):
                 continue
-            functions = known_functions(task.model, task.x, task.u)
+            functions = compiled_functions(task.model, options, task.x, task.u)
             if functions is not None:
                 key = (id(functions.kernels), task.x.shape, len(task.model.weight))
                 groups.setdefault(key, []).append((i, functions))

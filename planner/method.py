@@ -39,10 +39,13 @@ def solve(model: Model, options: Options, x: Array, u: Array, *, free_first: boo
     """
     if not uses_newton(model, options):
         return _convex(model, options, x, u, free_first)
-    functions = functions_of(model, x, u, native=driver() is not None)
-    if options.callback is None and (fast := driver()) is not None and functions.kernels:
+    functions = compiled_functions(model, options, x, u)
+    if functions is not None:
+        fast = driver()
+        assert fast is not None
         first = fast.solve_one(model, functions, options, x, u, free_first=free_first)
     else:
+        functions = functions_of(model, x, u, native=False)
         first = loop.iterate(model, functions, options, x, u, free_first=free_first)
     return second_chance(model, options, x, u, first)
 
@@ -80,11 +83,25 @@ def driver() -> ModuleType | None:
     return run
 
 
-def known_functions(model: Model, x: Array, u: Array) -> Functions | None:
-    """Functions for the compiled iteration; None where it cannot run."""
+def compiled_functions(model: Model, options: Options, x: Array, u: Array) -> Functions | None:
+    """Functions for the compiled iteration; None where it cannot, or shall not, run.
+
+    Raises:
+        ImportError: if it is asked for and numba is missing.
+        ValueError: if it is asked for and the problem's functions cannot be traced.
+    """
+    if options.compiled is False or options.callback is not None:
+        return None
     if driver() is None:
+        if options.compiled:
+            raise ImportError('compiled=True needs numba: pip install "slipcar[fast]"')
         return None
     functions = functions_of(model, x, u, native=True)
+    if functions.kernels is None and options.compiled:
+        raise ValueError(
+            f"compiled=True, but the functions of {type(model.problem).__name__} cannot be "
+            f"compiled: {functions.reason}"
+        )
     return functions if functions.kernels else None
 
 

@@ -29,6 +29,7 @@ class Options:
     linearization: str = "composite"
     terminal_tolerance: float = 0.0
     integrator: str = "euler"
+    compiled: bool | None = None
     callback: Callable[[Iteration], bool | None] | None = None
 
     def __post_init__(self) -> None:
@@ -41,6 +42,10 @@ class Options:
             check_choice("trust_region", self.trust_region, TRUST_REGIONS)
         check_choice("linearization", self.linearization, ("composite", "literal"))
         check_choice("integrator", self.integrator, INTEGRATORS)
+        if self.compiled not in (None, True, False):
+            raise ValueError(f"compiled must be None, True or False, not {self.compiled!r}")
+        if self.compiled and self.callback is not None:
+            raise ValueError("compiled=True leaves no room for a callback: leave compiled out")
         if self.method == "newton" and self.only_convex:
             raise ValueError(
                 f"method='newton' cannot be combined with {self.only_convex}: "
@@ -73,6 +78,7 @@ class Options:
             "linearization": self.linearization,
             "terminal_tolerance": float(self.terminal_tolerance),
             "integrator": self.integrator,
+            "compiled": self.compiled,
         }
 
 

@@ -40,6 +40,7 @@ def plan(
     linearization: str = "composite",
     terminal_tolerance: float = 0.0,
     integrator: str = "euler",
+    compiled: bool | None = None,
     starts: int = 1,
     guess: Plan | tuple[Array, Array] | None = None,
     cold_start: str = "auto",
@@ -74,6 +75,9 @@ def plan(
         terminal_tolerance: half-width of a box round E g = 0; 0 asks for equality.
         integrator: of the mean: `"euler"` (the paper's) or `"rk4"`; controls are constant on each
             interval either way. See :mod:`slipcar.planner.integrators`.
+        compiled: run Newton's method compiled by numba, the same steps to rounding errors. None:
+            where numba is installed and the problem's functions can be traced, and no callback
+            is to be called on the way.
         starts: guesses to try, ≥ 1: the problem's own and others round the obstacles; the best
             plan is returned and `alternatives` says what became of each.
         guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
@@ -118,6 +122,7 @@ def plan(
         linearization=linearization,
         terminal_tolerance=terminal_tolerance,
         integrator=integrator,
+        compiled=compiled,
         callback=callback,
     )
     check_count("starts", starts)

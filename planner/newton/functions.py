@@ -31,7 +31,13 @@ _STEP = 6e-6
 
 @dataclasses.dataclass(frozen=True)
 class Functions:
-    """The six functions of a problem, parameters bound; see `codegen.traced.Kernels`."""
+    """The six functions of a problem, parameters bound; see `codegen.traced.Kernels`.
+
+    Attributes:
+        kernels: what they are bound from; None if they are put together from the model's own.
+        parameters: in one row.
+        reason: why the problem could not be traced; empty if it could.
+    """
 
     stage: Callable[..., Rows]
     node: Callable[..., Rows]
@@ -41,12 +47,13 @@ class Functions:
     terminal_hessian: Callable[..., Rows]
     kernels: Kernels | None
     parameters: Array
+    reason: str = ""
 
 
-#: Kernels by kind of problem, or by the object where it names no parameters; None where it
-#: cannot be traced. And what was found for immutable problems, comparison included.
-_KINDS: dict[Any, Kernels | None] = {}
-_OBJECTS: weakref.WeakKeyDictionary[Any, dict[Any, Kernels | None]] = weakref.WeakKeyDictionary()
+#: Kernels by kind of problem, or by the object where it names no parameters; why not, where
+#: it cannot be traced. And what was found for immutable problems, comparison included.
+_KINDS: dict[Any, Kernels | str] = {}
+_OBJECTS: weakref.WeakKeyDictionary[Any, dict[Any, Kernels | str]] = weakref.WeakKeyDictionary()
 _FOUND = Recent()
 
 
@@ -74,11 +81,12 @@ def _find(model: Model, x: Array, u: Array, native: bool) -> Functions:
     parameters = parameter_row(model.problem)
     for fresh in (False, True):
         kernels = _kernels(model, native, fresh)
-        if kernels is None:
-            break
+        if isinstance(kernels, str):
+            return dataclasses.replace(_from_model(model), reason=kernels)
         if _agree(model, kernels, parameters, x, u):
             return _bound(kernels, parameters)
-    return _from_model(model)
+    say = "traced, they give other values than called (do they depend on anything else?)"
+    return dataclasses.replace(_from_model(model), reason=say)
 
 
 def _bound(kernels: Kernels, parameters: Array) -> Functions:
@@ -90,10 +98,10 @@ def _bound(kernels: Kernels, parameters: Array) -> Functions:
     return Functions(**six, kernels=kernels, parameters=parameters)
 
 
-def _kernels(model: Model, native: bool, fresh: bool) -> Kernels | None:
-    """Known kernels or, `fresh`, from a new trace."""
+def _kernels(model: Model, native: bool, fresh: bool) -> Kernels | str:
+    """Known kernels or, `fresh`, from a new trace; why there are none."""
     kind = kind_of(model)
-    kinds: dict[Any, Kernels | None] = _KINDS
+    kinds: dict[Any, Kernels | str] = _KINDS
     if kind is None:
         try:
             kinds = _OBJECTS.setdefault(model.problem, {})
@@ -105,11 +113,11 @@ def _kernels(model: Model, native: bool, fresh: bool) -> Kernels | None:
     return kinds[key]
 
 
-def _try_trace(model: Model, native: bool) -> Kernels | None:
+def _try_trace(model: Model, native: bool) -> Kernels | str:
     try:
         return trace(model, native=native)
-    except TraceError:
-        return None
+    except TraceError as error:
+        return str(error)
 
 
 def _agree(model: Model, kernels: Kernels, parameters: Array, x: Array, u: Array) -> bool:
