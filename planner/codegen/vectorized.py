@@ -40,6 +40,15 @@ class VectorizedKernel:
         self.run(*(array.T for array in rows.values()), *out.values())
         return out
 
+    def unchecked(self, **arrays: np.ndarray) -> dict[str, np.ndarray]:
+        """The same for float64 arrays of the right shapes: (count, width), or (count,) for one."""
+        columns = [a if a.ndim == 1 else a.T for a in (arrays[name] for name in self.inputs)]
+        columns = [c[None] if c.ndim == 1 else c for c in columns]
+        count = columns[0].shape[1]
+        out = {name: np.zeros((count, width)) for name, width in self.outputs.items()}
+        self.run(*columns, *out.values())
+        return out
+
 
 def rows_of(
     arrays: dict[str, np.ndarray], widths: dict[str, int], shared: frozenset[str]

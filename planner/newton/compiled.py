@@ -211,6 +211,19 @@ def _half_largest(array):
 
 
 @numba.njit(error_model="numpy")
+def _gramian_trace(A, B, dt, R, G):
+    """`lq.gramian_trace`."""
+    K, n = A.shape[0], A.shape[1]
+    inverse = np.linalg.inv(R)
+    Phi, total = G.copy(), 0.0
+    for k in range(K - 1, -1, -1):
+        pushed = Phi @ B[k]
+        total += np.sum(pushed * (pushed @ inverse)) / (2.0 * dt[k])
+        Phi = Phi @ A[k]
+    return total
+
+
+@numba.njit(error_model="numpy")
 def _consistent(at, tuning):
     """`loop._consistent`."""
     x, values = at[14], at[19]
@@ -257,6 +270,9 @@ def _iterate(
     started = ticks()
     if not evaluate(addresses, parameters, times, dt, R, weight, w, at):
         return NOT_FINITE, 0
+    gramian = _gramian_trace(at[1], at[2], dt, R, at[13])
+    if gramian > 0.0:
+        kappa = tuning.terminal_curvature * t / gramian
     for iteration in range(max_iterations):
         if released and (
             settling < tuning.released * at[19][0] or iteration >= tuning.released_steps
@@ -276,26 +292,26 @@ def _iterate(
         )  # fmt: skip
         linearized = ticks() - started
         solves, convex, same = 0, False, True
+        # What is left of the Gramian under the terminal curvature.
+        seen = gramian / (1.0 + kappa * gramian) if curved else gramian
         for _ in range(tuning.inertia_trials):
             for bound_round in range(tuning.bound_rounds):
                 _load(
                     dt, hinges, at, Q, q, Rk, r, shift if curved else 0.0,
-                    kappa if newton else 0.0, low, high, lower, upper, stiffness, Qs, qs, Rs, rs,
+                    kappa if curved else 0.0, low, high, lower, upper, stiffness, Qs, qs, Rs, rs,
                 )  # fmt: skip
                 if addresses[6] != 0:
-                    convex, trace = sweep(
-                        addresses, A, B, f, Q_nodes, q_nodes, Rs, rs, S, at[13], at[12], V, gains,
+                    convex = sweep(
+                        addresses, A, B, f, Q_nodes, q_nodes, Rs, rs, S, at[13], at[12], seen, V, gains,
                         pivots, d_nodes, ee, adjoint, nu,
                     )  # fmt: skip
                 else:
-                    convex, trace = solve_lq(
-                        A, B, f, Qs, qs, Rs, rs, S, at[13], at[12], work, de, ee, adjoint, nu
+                    convex = solve_lq(
+                        A, B, f, Qs, qs, Rs, rs, S, at[13], at[12], seen, work, de, ee, adjoint, nu
                     )
                 solves += 1
                 if not convex:
                     break
-                if not newton and t > 0:
-                    kappa = tuning.terminal_curvature * t / trace
                 same = _active_bounds(u, ee, lower, upper, low, high, low_new, high_new)
                 if same:
                     break

@@ -91,11 +91,20 @@ def _find(model: Model, x: Array, u: Array, native: bool) -> Functions:
 
 def _bound(kernels: Kernels, parameters: Array) -> Functions:
     def bound(kernel: Any) -> Callable[..., Rows]:
-        return lambda **arrays: kernel(**arrays, parameters=parameters)
+        call = getattr(kernel, "unchecked", kernel)
+        row = parameters[None]
+        return lambda **arrays: call(**arrays, parameters=row)
 
-    names = [f.name for f in dataclasses.fields(Functions)][:6]
-    six = {name: bound(getattr(kernels, name)) for name in names}
-    return Functions(**six, kernels=kernels, parameters=parameters)
+    return Functions(
+        stage=bound(kernels.stage),
+        node=bound(kernels.node),
+        terminal=bound(kernels.terminal),
+        stage_hessian=bound(kernels.stage_hessian),
+        node_hessian=bound(kernels.node_hessian),
+        terminal_hessian=bound(kernels.terminal_hessian),
+        kernels=kernels,
+        parameters=parameters,
+    )
 
 
 def _kernels(model: Model, native: bool, fresh: bool) -> Kernels | str:

@@ -74,7 +74,7 @@ def evaluate(addresses, parameters, times, dt, R, weight, w, at):
             values[0] += dt[k] * value * u[k, i]
             values[2] += dt[k] * ell[k, i] * u[k, i]
         for o in range(p):
-            if c[k, o] > 0.0:
+            if not c[k, o] <= 0.0:  # also if it is NaN
                 values[1] += dt[k] * weight[o] * c[k, o] * c[k, o]
         values[2] += dt[k] * H[k, 0]
         for i in range(n):
@@ -84,9 +84,17 @@ def evaluate(addresses, parameters, times, dt, R, weight, w, at):
         values[5] = max(values[5], abs(g[j]))
     if w > 0.0:
         values[3] = variance(w, A, sigma, d_sigma, dt, Lambda, vg, vh)
-    # A sum is finite only if every summand is (infinities cancel to NaN).
-    total = values.sum() + g.sum() + G.sum() + defect.sum() + A.sum() + B.sum() + sigma.sum()
-    total += c.sum() + C.sum() + ell.sum() + d_ell.sum() + Hx.sum() + Hxx.sum()
+    # A sum is finite only if every summand is (infinities cancel to NaN). Derivatives other than A
+    # are left out: where values are finite they are too, or the LQ problem finds out.
+    total = values.sum() + g.sum()
+    for k in range(K):
+        for i in range(n):
+            total += defect[k, i]
+            for j in range(n):
+                total += A[k, i, j]
+            if w == 0.0:  # otherwise it is in the variance
+                for j in range(sigma.shape[2]):
+                    total += sigma[k, i, j]
     return np.isfinite(total)
 
 

@@ -41,7 +41,7 @@ from slipcar.planner.convexify import Linearization, nearest_semidefinite
 from slipcar.planner.feasibility import not_finite
 from slipcar.planner.history import Iteration
 from slipcar.planner.newton.functions import Functions
-from slipcar.planner.newton.lq import LqSolution, solve_lq
+from slipcar.planner.newton.lq import LqSolution, LqSolver, gramian_trace
 from slipcar.planner.newton.settings import TUNING
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
@@ -74,7 +74,10 @@ class Iterate:
     @property
     def finite(self) -> bool:
         """Whether the problem's functions are finite everywhere."""
-        return self.lin.finite and all(np.isfinite(a).all() for a in (self.d_ell, self.H_xx))
+        lin = self.lin
+        # A sum is finite only if every entry is.
+        arrays = (lin.A, lin.B, lin.defect, lin.sigma, lin.c, lin.C, lin.g, lin.G)
+        return bool(np.isfinite(sum(a.sum() for a in (*arrays, self.d_ell, self.H_xx))))
 
     @property
     def cost(self) -> float:
@@ -86,13 +89,13 @@ class Iterate:
 
 @dataclasses.dataclass(frozen=True)
 class _Quadratic:
-    """The model of the cost without its hinges; arguments of `solve_lq`."""
+    """The model of the cost without its hinges; arguments of `LqSolver.solve`."""
 
     Q: Array
     q: Array
     R: Array
     r: Array
-    S: Array
+    S: Array | None  # None: zero
 
 
 def iterate(
@@ -117,7 +120,10 @@ def iterate(
     K, n = at.lin.defect.shape
     q = len(at.lin.g)
     adjoint, terminal = np.zeros((K, n)), np.zeros(q)
-    shift, last, rejected, kappa, settling = 0.0, np.inf, 0, 0.0, np.inf
+    shift, last, rejected, settling = 0.0, np.inf, 0, np.inf
+    solver = LqSolver(K, n, u.shape[1], q)
+    R = 2.0 * model.dt[:, None, None] * model.R
+    gramian = gramian_trace(at.lin.A, at.lin.B, R, at.lin.G)
     unit = float(np.max(np.diag(model.R)))  # of a shift
     bounds = (np.zeros(u.shape, dtype=bool), np.zeros(u.shape, dtype=bool))
     history: list[Iteration] = []
@@ -147,7 +153,9 @@ def iterate(
                 bounds,
                 np.zeros_like(model.weight) if released else model.weight,
                 shift if curved else 0.0,
-                kappa if newton else 0.0,
+                solver,
+                gramian,
+                curved,
             )
             solves += more
             if found is not None or not curved:
@@ -157,8 +165,6 @@ def iterate(
         if found is None:
             status = Status.SOLVER_FAILED
             break
-        if not newton and q > 0:
-            kappa = TUNING.terminal_curvature * q / found.gramian
         search = _search(model, functions, w, at, quadratic, found, newton, fallback)
         new, alpha, accepted = search.new, search.alpha, search.accepted
         step = alpha**2 * float(np.vdot(model.dt[:, None] * search.e, search.e))
@@ -292,13 +298,13 @@ def _quadratic(
     q = lin.q_running.copy()
     Q = dt[:, None, None] * at.H_xx
     R = 2.0 * dt[:, None, None] * model.R
-    r = np.einsum("kij,kj->ki", R, lin.u) + lin.r_running
-    S = np.zeros((K, m, n))
+    r = _times(R, lin.u) + lin.r_running
+    S = None
     if curved:
         t = model.times
         second = functions.stage_hessian(t=t[:-1], dt=dt, x=lin.x[:-1], u=lin.u, adjoint=adjoint)
         Q[:-1] += second["xx"].reshape(K, n, n)[1:]
-        S = second["ux"].reshape(K, m, n)
+        S = second["ux"].reshape(K, m, n) if second["ux"].any() else None
         R += second["uu"].reshape(K, m, m)
         if lin.c.shape[1]:
             eta = 2.0 * dt[:, None] * model.weight * np.maximum(lin.c, 0.0)
@@ -321,20 +327,29 @@ def _solve(
     bounds: tuple[Array, Array],
     weight: Array,
     shift: float,
-    kappa: float,
+    solver: LqSolver,
+    gramian: float,
+    curved: bool,
 ) -> tuple[LqSolution | None, tuple[Array, Array], int]:
     """Solve the model with the hinges that are on; the active bounds; LQ problems solved."""
     lin, dt = at.lin, model.dt
     h = 2.0 * dt[:, None] * weight * (lin.c > 0.0)
-    Q = quadratic.Q + np.einsum("kp,kpi,kpj->kij", h, lin.C, lin.C)
-    q = quadratic.q + np.einsum("kp,kp,kpi->ki", h, lin.c, lin.C)
+    Q, q = quadratic.Q, quadratic.q
+    if h.any():
+        rows = lin.C.swapaxes(1, 2)
+        Q = Q + rows @ (h[..., None] * lin.C)
+        q = q + _times(rows, h * lin.c)
+    elif curved:
+        Q, q = Q.copy(), q.copy()
     R = quadratic.R
     if shift > 0.0:
         level = 2.0 * shift * dt[:, None, None]
         Q, R = Q + level * np.eye(Q.shape[1]), R + level * np.eye(R.shape[1])
-    if kappa > 0.0:
+    if curved and gramian > 0.0:
+        kappa = TUNING.terminal_curvature * len(lin.g) / gramian
         Q[-1] += kappa * lin.G.T @ lin.G
         q[-1] += kappa * lin.G.T @ lin.g
+        gramian /= 1.0 + kappa * gramian  # what is left of it under this curvature
     bounded = model.bounded
     lower, upper = model.lower - lin.u, model.upper - lin.u
     stiffness = TUNING.bound_stiffness * 2.0 * float(np.max(dt) * np.max(np.diag(model.R)))
@@ -347,7 +362,10 @@ def _solve(
             Rb, on = R.copy(), low | high
             Rb[:, diagonal, diagonal] += stiffness * on
             rb = rb - stiffness * np.where(high, upper, np.where(low, lower, 0.0))
-        found = solve_lq(lin.A, lin.B, lin.defect, Q, q, Rb, rb, quadratic.S, lin.G, lin.g)
+        found = solver.solve(
+            lin.A, lin.B, lin.defect, Q, q, Rb, rb, quadratic.S, lin.G, lin.g,
+            gramian, convex=not curved,
+        )  # fmt: skip
         if found is None or not bounded:
             return found, bounds, solves
         new = (found.e < lower, found.e > upper)
@@ -392,10 +410,11 @@ def _search(
     lin, dt, d = at.lin, model.dt, found.d
     e = np.clip(lin.u + found.e, model.lower, model.upper) - lin.u
     value = at.cost - lin.penalty
-    value += float(np.vdot(quadratic.q, d) + 0.5 * np.einsum("ki,kij,kj", d, quadratic.Q, d))
-    value += float(np.vdot(quadratic.r, e) + 0.5 * np.einsum("ki,kij,kj", e, quadratic.R, e))
-    value += float(np.einsum("ki,kij,kj", e[1:], quadratic.S[1:], d[:-1]))
-    c = np.maximum(np.einsum("kpn,kn->kp", lin.C, d) + lin.c, 0.0)
+    value += float(np.vdot(quadratic.q + 0.5 * _times(quadratic.Q, d), d))
+    value += float(np.vdot(quadratic.r + 0.5 * _times(quadratic.R, e), e))
+    if quadratic.S is not None:
+        value += float(np.vdot(e[1:], _times(quadratic.S[1:], d[:-1])))
+    c = np.maximum(_times(lin.C, d) + lin.c, 0.0)
     value += float(np.vdot(dt[:, None] * model.weight, c * c))
     price = 0.5 * float(np.max(np.abs(found.adjoint)))
     dear = 0.5 * float(np.max(np.abs(found.terminal), initial=0.0))
@@ -434,6 +453,11 @@ def _search(
             break
         alpha *= 0.5
     return _Search(new, e, alpha, accepted, merit, predicted, actual, noise)
+
+
+def _times(M: Array, v: Array) -> Array:
+    """Matrix times vector at every node: (K, i, j), (K, j) -> (K, i)."""
+    return (M @ v[..., None])[..., 0]
 
 
 class _Circling:

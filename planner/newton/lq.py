@@ -1,30 +1,33 @@
-"""The LQ problem of one iteration by a Riccati recursion, in NumPy.
+"""The LQ problem of one iteration in NumPy and LAPACK.
 
-    minimise   Σ_{k=0}^{K-1} ½ e_kᵀR_k e_k + r_kᵀe_k + e_kᵀS_k d_k  +  Σ_{k=1}^{K} ½ d_kᵀQ_k d_k
-               + q_kᵀd_k
+    minimise   Σ_{k=0}^{K-1} ½ e_kᵀR_k e_k + r_kᵀe_k + e_kᵀS_k d_k  +  Σ_{k=1}^{K} ½ d_kᵀQ_k d_k + q_kᵀd_k
     s.t.       d_{k+1} = A_k d_k + B_k e_k + f_k,   d_0 = 0,   G d_K + g = 0
 
-With the multiplier ν of the terminal condition the cost to go is a quadratic form in
-y = (d, 1, ν), one symmetric matrix V_k:
+Solved as one banded system (:mod:`slipcar.planner.backends.kkt`), in which Q may be indefinite.
+Whether the problem is then convex in the controls, so that the solution is a minimum, is a question
+of inertia. The compiled iteration reads it off the pivots of its recursion (:mod:`.riccati`); here
 
-    T_k = cost of stage k + F_kᵀ V_{k+1} F_k,   F_k: (e, d, 1, ν) -> (d⁺, 1, ν)
-    V_k = what is left of T_k when e is eliminated (its Schur complement)
+    H + c CᵀC  is positive definite,    C d = f the dynamics,  c large,
 
-Q may be indefinite. The pivots of the elimination are positive exactly if the problem is convex in
-the controls: the inertia test of Newton's method. In ν the form is concave; its stationary point
-is the terminal condition. :mod:`.riccati` is the same recursion compiled.
+by a banded Cholesky factorisation (Debreu's lemma: H is positive definite where C vanishes).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
+from scipy.linalg import lapack
+
+from slipcar.planner.backends.kkt import BandedKkt
 
 Array = np.ndarray
 
-#: The system of the terminal condition is regularised by this much, relative to its trace.
+#: The system of the terminal condition is regularised by this much, relative to its Gramian.
 SOFTNESS = 1e-13
+#: c of the inertia test, relative to the largest entry of Q.
+_PENALTY = 1e7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,82 +39,122 @@ class LqSolution:
         e: (K, m).
         adjoint: λ_1..λ_K, (K, n).
         terminal: ν, (q,).
-        gramian: trace of the Gramian of the terminal condition.
     """
 
     d: Array
     e: Array
     adjoint: Array
     terminal: Array
-    gramian: float
 
 
-def solve_lq(
-    A: Array, B: Array, f: Array, Q: Array, q: Array, R: Array, r: Array, S: Array, G: Array,
-    g: Array,
-) -> LqSolution | None:  # fmt: skip
-    """Solve; None if the problem is not convex in the controls, or the solution not finite.
+class LqSolver:
+    """Solves LQ problems of one shape; index arrays are computed once.
+
+    Args:
+        K: intervals.
+        n: states.
+        m: controls.
+        q: terminal conditions.
+    """
+
+    def __init__(self, K: int, n: int, m: int, q: int) -> None:
+        self._kkt = BandedKkt(K, n, q)
+        self._inertia = _Inertia(K, n, m)
+        self._held = np.ones(q, dtype=bool)
+        self._none = np.zeros((K, 0, n)), np.zeros((K, 0))
+
+    def solve(
+        self, A: Array, B: Array, f: Array, Q: Array, q: Array, R: Array, r: Array, S: Array | None,
+        G: Array, g: Array, gramian: float, *, convex: bool,
+    ) -> LqSolution | None:  # fmt: skip
+        """Solve; None if the problem is not convex in the controls, or singular.
+
+        Args:
+            A: (K, n, n).
+            B: (K, n, m).
+            f: (K, n).
+            Q: nodes 1..K, (K, n, n).
+            q: (K, n).
+            R: (K, m, m), positive definite.
+            r: (K, m).
+            S: (K, m, n) or None for zero; that of node 0 has no effect.
+            G: (q, n).
+            g: (q,).
+            gramian: scale of the terminal condition; see :func:`gramian_trace`.
+            convex: whether the problem is known to be convex.
+        """
+        if not convex and not self._inertia.positive(A, B, Q, R, S):
+            return None
+        law: Array | None = None
+        if S is not None:
+            # With e = e′ − R⁻¹ (S d + r) the cross term is gone.
+            law = np.linalg.solve(R, np.concatenate([S, r[..., None]], axis=2))
+            law[0, :, :-1] = 0.0
+            A = A - B @ law[..., :-1]
+            f = f - (B @ law[..., -1:])[..., 0]
+            Q, q = Q.copy(), q.copy()
+            across = S[1:].swapaxes(1, 2)
+            Q[:-1] -= across @ law[1:, :, :-1]
+            q[:-1] -= (across @ law[1:, :, -1:])[..., 0]
+            r = np.zeros_like(r)
+        rows, none = self._none
+        self._kkt.load(
+            SimpleNamespace(A=A, B=B, f=f, Q=Q, q=q, R=R, r=r, a=rows, G=G)  # type: ignore[arg-type]
+        )
+        softness = np.full(len(g), -SOFTNESS * gramian)
+        point = self._kkt.solve(none, none, self._held, softness, -g)
+        if point is None:
+            return None
+        e = point.e
+        if law is not None:
+            before = np.vstack([np.zeros_like(point.d[:1]), point.d[:-1]])
+            e = e - (law[..., :-1] @ before[..., None])[..., 0] - law[..., -1]
+        return LqSolution(point.d, e, point.adjoint, point.terminal)
+
+
+def gramian_trace(A: Array, B: Array, R: Array, G: Array) -> float:
+    """Σ tr(G Φ_k B_k R_k⁻¹ B_kᵀΦ_kᵀGᵀ): how far controls of unit cost move the end.
 
     Args:
         A: (K, n, n).
         B: (K, n, m).
-        f: (K, n).
-        Q: nodes 1..K, (K, n, n).
-        q: (K, n).
         R: (K, m, m).
-        r: (K, m).
-        S: (K, m, n); that of node 0 has no effect.
         G: (q, n).
-        g: (q,).
     """
-    K, n = f.shape
-    m, t = B.shape[2], len(g)
-    F = np.zeros((K, n + 1 + t, m + n + 1 + t))
-    F[:, :n, :m], F[:, :n, m : m + n], F[:, :n, m + n] = B, A, f
-    F[:, range(n, n + 1 + t), range(m + n, m + n + 1 + t)] = 1.0
-    T_all = np.zeros((K, m + n + 1 + t, m + n + 1 + t))
-    T_all[:, :m, :m], T_all[:, :m, m + n], T_all[:, m + n, :m] = R, r, r
-    T_all[:, :m, m : m + n], T_all[:, m : m + n, :m] = S, S.swapaxes(1, 2)
-    T_all[1:, m : m + n, m : m + n] = Q[:-1]
-    T_all[1:, m : m + n, m + n] = T_all[1:, m + n, m : m + n] = q[:-1]
-    V = np.zeros((n + 1 + t, n + 1 + t))
-    V[:n, :n], V[:n, n], V[n, :n] = Q[-1], q[-1], q[-1]
-    V[:n, n + 1 :], V[n + 1 :, :n] = G.T, G
-    V_all, gains = np.empty((K, n + 1 + t, n + 1 + t)), np.empty((K, m, n + 1 + t))
-    for k in range(K - 1, -1, -1):
-        V_all[k] = V
-        Fk = F[k]
-        T = Fk.T.dot(V).dot(Fk)
-        T += T_all[k]
-        # Gauss–Jordan on the controls: the first m rows become the feedback law.
-        for i in range(m):
-            pivot = T[i, i]
-            if not pivot > 0.0:
-                return None
-            row = T[i] / pivot
-            T -= T[:, i, None] * row
-            T[i] = row
-        gains[k] = T[:m, m:]
-        V = T[m:, m:]
-        V = 0.5 * (V + V.T)
-    W, s = -V[n + 1 :, n + 1 :], V[n + 1 :, n]
-    gramian = float(np.trace(W))
-    y = np.zeros(n + 1 + t)
-    y[n] = 1.0
-    if t > 0:
-        if not (np.isfinite(gramian) and gramian > 0.0):
-            return None
-        W = W + SOFTNESS * gramian * np.eye(t)
-        try:
-            np.linalg.cholesky(W)
-        except np.linalg.LinAlgError:
-            return None
-        y[n + 1 :] = np.linalg.solve(W, s + g)
-    e, d, adjoint = np.empty((K, m)), np.empty((K, n)), np.empty((K, n))
-    for k in range(K):
-        e[k] = -gains[k].dot(y)
-        d[k] = y[:n] = F[k, :n, :m].dot(e[k]) + F[k, :n, m:].dot(y)
-        adjoint[k] = V_all[k, :n].dot(y)
-    if not np.isfinite(adjoint).all():
-        return None
-    return LqSolution(d, e, adjoint, y[n + 1 :].copy(), gramian)
+    Phi, total = G, 0.0
+    moved = B @ np.linalg.inv(R) @ B.swapaxes(1, 2)
+    for k in range(len(A) - 1, -1, -1):
+        total += float(np.vdot(Phi, Phi.dot(moved[k])))
+        Phi = Phi.dot(A[k])
+    return total
+
+
+class _Inertia:
+    """Whether the problem is strictly convex where the dynamics hold."""
+
+    def __init__(self, K: int, n: int, m: int) -> None:
+        self._shape = (K, n, m)
+        block = n + m  # variables e_k, d_{k+1}; stage k couples d_k, e_k and d_{k+1}
+        self._size, self._width = K * block, 2 * block
+        i = np.arange(n + block)
+        first = (np.arange(K) * block - n)[:, None, None]
+        row, column = np.broadcast_arrays(first + i[:, None], first + i[None, :])
+        self._kept = (row >= column) & (column >= 0)
+        self._at = (column * self._width + row - column)[self._kept]
+
+    def positive(self, A: Array, B: Array, Q: Array, R: Array, S: Array | None) -> bool:
+        """Arguments as for `LqSolver.solve`."""
+        K, n, m = self._shape
+        C = np.empty((K, n, 2 * n + m))
+        C[..., :n], C[..., n : n + m], C[..., n + m :] = A, B, -np.eye(n)
+        largest = max(float(np.max(np.abs(Q))), float(np.min(np.einsum("kii->ki", R).max(axis=1))))
+        M = (_PENALTY * largest) * (C.swapaxes(1, 2) @ C)
+        M[:, n + m :, n + m :] += Q
+        M[:, n : n + m, n : n + m] += R
+        if S is not None:
+            M[:, n : n + m, :n] += S
+        band = np.bincount(self._at, M[self._kept], minlength=self._size * self._width)
+        band = band.reshape(self._size, self._width).T
+        if not np.isfinite(largest):
+            return False
+        return lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0

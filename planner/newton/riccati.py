@@ -18,7 +18,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-#: The system of the terminal condition is regularised by this much, relative to its trace.
+#: The system of the terminal condition is regularised by this much, relative to its Gramian.
 SOFTNESS = 1e-13
 
 
@@ -41,11 +41,11 @@ def workspace(K, n, m, t):
 
 
 @numba.njit(error_model="numpy")
-def solve_lq(A, B, f, Q, q, R, r, S, G, g, work, d, e, adjoint, nu):
+def solve_lq(A, B, f, Q, q, R, r, S, G, g, gramian, work, d, e, adjoint, nu):
     """Solve; write deviations d (K, n), e (K, m), adjoint (K, n) and ν (q,).
 
     Returns:
-        Whether the problem is convex in the controls and the solution finite; trace of W.
+        Whether the problem is convex in the controls and the solution finite.
     """
     P_all, p_all, Pi_all, gains, L, raw, BtP, PA, y, W, s = work
     K, n = f.shape
@@ -84,7 +84,7 @@ def solve_lq(A, B, f, Q, q, R, r, S, G, g, work, d, e, adjoint, nu):
                     value -= L[i, v] * L[j, v]
                 if i == j:
                     if not value > 0.0:
-                        return False, 0.0
+                        return False
                     L[i, i] = np.sqrt(value)
                 else:
                     L[i, j] = value / L[j, j]
@@ -170,17 +170,12 @@ def solve_lq(A, B, f, Q, q, R, r, S, G, g, work, d, e, adjoint, nu):
                 mean = 0.5 * (newP[i, j] + newP[j, i])
                 newP[i, j] = mean
                 newP[j, i] = mean
-    trace = 0.0
-    for j in range(t):
-        trace += W[j, j]
     if t > 0:
         for j in range(t):
-            W[j, j] += SOFTNESS * trace
+            W[j, j] += SOFTNESS * gramian
             s[j] += g[j]
-        if not np.isfinite(trace) or not trace > 0.0:
-            return False, trace
         if not solve_symmetric(W, s):
-            return False, trace
+            return False
         for j in range(t):
             nu[j] = s[j]
     for k in range(K):
@@ -209,8 +204,8 @@ def solve_lq(A, B, f, Q, q, R, r, S, G, g, work, d, e, adjoint, nu):
                 value += P_all[k, i, j] * d[k, j]
             adjoint[k, i] = value
             if not np.isfinite(value):
-                return False, trace
-    return True, trace
+                return False
+    return True
 
 
 @numba.njit(error_model="numpy")

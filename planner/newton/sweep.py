@@ -11,7 +11,7 @@ from slipcar.planner.newton.riccati import SOFTNESS, solve_symmetric
 
 @numba.njit(error_model="numpy")
 def sweep(
-    addresses, A, B, f, Q_nodes, q_nodes, R, r, S, G, g, V, gain, pivot, d_nodes, e, adjoint, nu
+    addresses, A, B, f, Q_nodes, q_nodes, R, r, S, G, g, gramian, V, gain, pivot, d_nodes, e, adjoint, nu
 ):  # fmt: skip
     """:func:`.riccati.solve_lq` by generated code: see `codegen.recursion`."""
     K, n = f.shape
@@ -41,8 +41,7 @@ def sweep(
     for k in range(K):
         for i in range(m):
             if not pivot[k, i] > 0.0:
-                return False, 0.0
-    trace = 0.0
+                return False
     if t > 0:
         W, s = np.empty((t, t)), np.empty(t)
         for i in range(t):
@@ -51,15 +50,12 @@ def sweep(
             for j in range(i, t):
                 W[i, j] = -V[0, start + j - i]
                 W[j, i] = W[i, j]
-            trace += W[i, i]
             constant = n * (n + 1 + t) - n * (n - 1) // 2
             s[i] = V[0, constant + 1 + i] + g[i]
-        if not np.isfinite(trace) or not trace > 0.0:
-            return False, trace
         for i in range(t):
-            W[i, i] += SOFTNESS * trace
+            W[i, i] += SOFTNESS * gramian
         if not solve_symmetric(W, s):
-            return False, trace
+            return False
         nu[:] = s
     d_nodes[0] = 0.0
     call(
@@ -74,4 +70,4 @@ def sweep(
     for k in range(K):
         for i in range(n):
             total += adjoint[k, i]
-    return np.isfinite(total), trace
+    return np.isfinite(total)

@@ -91,8 +91,18 @@ def _kkt(p):
     z = np.linalg.solve(np.block([[H, M.T], [M, zero]]), -np.concatenate([c, v]))
     e, d, rest = np.split(z, [K * m, K * (m + n)])
     return lq.LqSolution(
-        d.reshape(K, n), e.reshape(K, m), rest[: K * n].reshape(K, n), rest[K * n :], np.nan
+        d.reshape(K, n), e.reshape(K, m), rest[: K * n].reshape(K, n), rest[K * n :]
     )
+
+
+def _gramian(p):
+    return lq.gramian_trace(p.A, p.B, p.R, p.G)
+
+
+def _by_lapack(p):
+    K, n = p.f.shape
+    solver = lq.LqSolver(K, n, p.B.shape[2], len(p.g))
+    return solver.solve(*p.arrays, _gramian(p), convex=False)
 
 
 def _by_loops(p):
@@ -100,8 +110,8 @@ def _by_loops(p):
     m, t = p.B.shape[2], len(p.g)
     work = riccati.workspace(K, n, m, t)
     d, e, adjoint, nu = (np.full(s, np.nan) for s in ((K, n), (K, m), (K, n), (t,)))
-    good, trace = riccati.solve_lq(*p.arrays, work, d, e, adjoint, nu)
-    return lq.LqSolution(d, e, adjoint, nu, trace) if good else None
+    good = riccati.solve_lq(*p.arrays, _gramian(p), work, d, e, adjoint, nu)
+    return lq.LqSolution(d, e, adjoint, nu) if good else None
 
 
 def _by_generated_code(p, known=None):
@@ -118,17 +128,17 @@ def _by_generated_code(p, known=None):
     nodes = np.zeros((K + 1, n, n)), np.zeros((K + 1, n))
     nodes[0][1:], nodes[1][1:] = p.Q, p.q
     d, e, adjoint, nu = (np.full(s, np.nan) for s in ((K + 1, n), (K, m), (K, n), (t,)))
-    good, trace = sweep(
+    good = sweep(
         addresses,
-        *(p.A, p.B, p.f, *nodes, p.R, p.r, p.S, p.G, p.g),
+        *(p.A, p.B, p.f, *nodes, p.R, p.r, p.S, p.G, p.g, _gramian(p)),
         *(np.zeros((K + 1, size * (size + 1) // 2)), np.empty((K, m, size)), np.empty((K, m))),
         *(d, e, adjoint, nu),
     )
-    return lq.LqSolution(d[1:], e, adjoint, nu, trace) if good else None
+    return lq.LqSolution(d[1:], e, adjoint, nu) if good else None
 
 
 SOLVERS = {
-    "numpy": lambda p: lq.solve_lq(*p.arrays),
+    "lapack": _by_lapack,
     "loops": _by_loops,
     "generated": _by_generated_code,
 }
@@ -180,7 +190,7 @@ def test_both_outcomes_of_the_inertia_test_occur_with_indefinite_weights():
     for seed in range(60):
         p = _random(seed, 4, 3, 2, 0, 0.5 + 0.02 * seed)
         indefinite = np.linalg.eigvalsh(p.Q)[:, 0].min() < 0.0
-        outcomes.append((indefinite, lq.solve_lq(*p.arrays) is not None))
+        outcomes.append((indefinite, _by_lapack(p) is not None))
     assert (True, True) in outcomes  # Q is indefinite, the problem convex all the same
     assert (True, False) in outcomes
 
@@ -218,23 +228,33 @@ def test_the_terminal_condition_holds_and_the_adjoint_ends_at_its_multiplier():
         np.testing.assert_allclose(found.adjoint[-1], end, rtol=1e-9, atol=1e-9)
 
 
-def test_the_solvers_see_the_same_gramian():
-    p = _random(4, 5, 4, 2, 2, 0.2)
-    traces = [solve(p).gramian for solve in SOLVERS.values()]
-    np.testing.assert_allclose(traces, traces[0], rtol=1e-10)
-    _, _, M, _ = _dense(p)
+def test_the_gramian_is_what_the_end_moves_by_for_controls_of_unit_cost():
+    p = dataclasses.replace(_random(4, 5, 4, 2, 2, 0.0), Q=np.zeros((5, 4, 4)))
     K, n, m = 5, 4, 2
+    _, _, M, _ = _dense(p)
     states = -np.linalg.solve(M[: K * n, K * m :], M[: K * n, : K * m])
     ends = p.G @ states[-n:]
     W = ends @ np.linalg.solve(_reduced_hessian(p), ends.T)
-    assert traces[0] == pytest.approx(np.trace(W), rel=1e-9)
+    assert _gramian(p) == pytest.approx(np.trace(W), rel=1e-12)
+
+
+@pytest.mark.parametrize("K", [1, 4])
+def test_a_problem_known_to_be_convex_and_one_without_cross_terms_are_the_same_problem(K):
+    p = _random(9, K, 3, 2, 1, 0.0)
+    p.S[:] = 0.0
+    solver = lq.LqSolver(K, 3, 2, 1)
+    arrays = p.arrays
+    arrays[7] = None
+    for convex in (False, True):
+        _close(solver.solve(*p.arrays, _gramian(p), convex=convex), _kkt(p), 1e-9)
+        _close(solver.solve(*arrays, _gramian(p), convex=convex), _kkt(p), 1e-9)
 
 
 def test_code_that_relies_on_known_entries_gives_the_same_answer():
     p = _random(5, 6, 3, 2, 2, 0.2)
     p.A[:, 0, 0], p.A[:, 2, 1], p.B[:, 0, :] = 1.0, 0.0, 0.0
     known = {("A", 0, 0): 1.0, ("A", 2, 1): 0.0, ("B", 0, 0): 0.0, ("B", 0, 1): 0.0}
-    _close(_by_generated_code(p, known), lq.solve_lq(*p.arrays), 1e-10)
+    _close(_by_generated_code(p, known), _by_lapack(p), 1e-10)
 
 
 def test_beyond_some_size_no_code_is_generated():
