@@ -29,12 +29,12 @@ CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
 
-.PHONY: help install compare test test-long train bench lint types lock peers clean
+.PHONY: help install compare test test-long train bench bench-worlds bench-docs lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/:.*## /:/' \
-		| while IFS=: read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
+		| while IFS=: read -r name text; do printf '  make %-12s %s\n' "$$name" "$$text"; done
 	@echo '  options: ARGS="..." for the command, PYTHON=python3.12 for a new $(VENV)'
 
 install: $(INSTALLED)  ## set up .venv (every other target does it when needed)
@@ -54,6 +54,12 @@ train: $(INSTALLED)  ## train the PPO baseline; runs/ppo
 bench: $(BENCH_INSTALLED)  ## time the planner beside its peers, environments, evaluation; results/bench
 	$(BIN)/python benchmarks/run.py $(ARGS)
 
+bench-worlds: $(BENCH_INSTALLED)  ## plan for 1000 random worlds, ours and IPOPT; results/bench
+	$(BIN)/python benchmarks/run.py --only worlds $(ARGS)
+
+bench-docs: $(BENCH_INSTALLED)  ## every benchmark once more, into docs/benchmarks.md
+	$(BIN)/python benchmarks/run.py --docs $(ARGS)
+
 lint: types  ## ruff (rules and format) and mypy
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -62,7 +68,7 @@ types: $(INSTALLED)  ## mypy over the installed package
 	$(BIN)/mypy
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare train bench: export OMP_NUM_THREADS ?= 1
+compare train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
 
 # Compiled once per machine, not once per renewed tree of links.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba

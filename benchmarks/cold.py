@@ -1,21 +1,33 @@
 """Cold start: a fresh process, import, first plan.
 
 The interpreter's own start is a row of its own. numba's cache is on disk (a call beforehand sees
-to that); "without numba" means that the import fails as it does where it is not installed.
+to that), and in one row, measured once, it is empty; "without numba" means that the import fails
+as it does where it is not installed.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from report import Section
 from rich.console import Console
 from rich.progress import track
+
+ABOUT = """\
+A fresh process that imports, plans for the paper's case, plans again and exits. *slipcar, numba*
+finds its compiled code in numba's cache on disk; *first plan ever* is the same with an empty
+cache, once: what a new installation, or a new version, pays one time. *Without numba*: as where it
+is not installed. A first plan contains what is set up for it; CasADi's rows build their programme,
+and import the scenario from slipcar too.
+"""
 
 _CHILD = Path(__file__).resolve().parent / "cold_plan.py"
 #: What the child is asked for, and what its row is called.
@@ -26,37 +38,62 @@ CASES = {
     "fatrop": "CasADi + fatrop",
     "ipopt": "CasADi + IPOPT",
 }
+FIRST_EVER = "slipcar, numba, first plan ever"
 ROUNDS = 7
 
+Seconds = dict[str, float]
 
-def rows(rounds: int = ROUNDS) -> list[dict[str, Any]]:
-    """Seconds by case: whole process, import, set-up and first plan, second plan."""
-    told: dict[str, list[dict[str, float]]] = {}
+
+def section(rounds: int = ROUNDS) -> Section:
+    """All of it, to be printed and kept."""
+    told, skipped = measure(rounds)
+    return Section(
+        part="cold",
+        title="Cold start",
+        about=ABOUT,
+        tables={"Import and first plan": [_row(name, measured) for name, measured in told.items()]},
+        notes=tuple(f"skipped {name}: {why}" for name, why in skipped.items()),
+        raw={"seconds": told},
+    )
+
+
+def measure(rounds: int) -> tuple[dict[str, list[Seconds]], dict[str, str]]:
+    """Seconds of each run by row, in turns, and why some rows are missing."""
+    told: dict[str, list[Seconds]] = {}
+    skipped: dict[str, str] = {}
     console = Console(stderr=True)
     for turn in track(range(rounds + 1), "cold start: in turns", console=console):
-        for case in CASES:
+        for case, name in CASES.items():
+            if name in skipped:
+                continue
             try:
                 measured = _fresh_process(case)
             except subprocess.CalledProcessError as error:
-                if turn == 0:
-                    last = error.stderr.strip().rpartition("\n")[2]
-                    print(f"skipped cold start of {CASES[case]}: {last}")
+                skipped[name] = error.stderr.strip().rpartition("\n")[2]
+                print(f"skipped cold start of {name}: {skipped[name]}")
                 continue
             if turn > 0:  # the first one fills the caches on disk
-                told.setdefault(case, []).append(measured)
-    return [_row(CASES[case], measured) for case, measured in told.items()]
+                told.setdefault(name, []).append(measured)
+    if CASES["numba"] in told:
+        with tempfile.TemporaryDirectory(prefix="slipcar-bench-") as empty:
+            told[FIRST_EVER] = [_fresh_process("numba", NUMBA_CACHE_DIR=empty)]
+    return told, skipped
 
 
-def _fresh_process(case: str) -> dict[str, float]:
+def _fresh_process(case: str, **environment: str) -> Seconds:
     began = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, str(_CHILD), case], capture_output=True, text=True, check=True
+        [sys.executable, str(_CHILD), case],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, **environment},
     )
     whole = time.perf_counter() - began
     return {"whole": whole, **json.loads(done.stdout)}
 
 
-def _row(name: str, measured: list[dict[str, float]]) -> dict[str, Any]:
+def _row(name: str, measured: list[Seconds]) -> dict[str, Any]:
     def column(key: str) -> np.ndarray:
         return np.array([one.get(key, np.nan) for one in measured])
 
@@ -66,8 +103,9 @@ def _row(name: str, measured: list[dict[str, float]]) -> dict[str, Any]:
         "fresh process": name,
         "whole [s] (median)": float(median),
         "quartiles": f"{low:.3g}–{high:.3g}",
+        "import + first plan [s]": float(np.median(column("import") + column("first"))),
         "import [s]": float(np.median(column("import"))),
-        "first plan, set-up included [s]": float(np.median(column("first"))),
+        "first plan [s]": float(np.median(column("first"))),
         "second plan [ms]": 1e3 * float(np.median(column("second"))),
         "start and exit [s]": float(np.median(column("whole") - inside)),
         "runs": len(measured),

@@ -52,6 +52,8 @@ class Contender:
         solve: plans from the scenario's own guess; returns seconds and the answer.
         solves: `EXACT`, or what it solves instead.
         build_seconds: what had to be built once beforehand took.
+        plans: how many one call of `solve` makes; the answer is the first's.
+        threads: cores it keeps busy.
     """
 
     name: str
@@ -59,6 +61,8 @@ class Contender:
     solve: Callable[[], tuple[float, Answer]]
     solves: str = EXACT
     build_seconds: float = 0.0
+    plans: int = 1
+    threads: int = 1
 
 
 @dataclasses.dataclass(frozen=True)

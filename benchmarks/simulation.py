@@ -7,10 +7,29 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from report import Section
 
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
 from slipcar.planner import OpenLoop, plan
+
+ABOUT = """\
+One process: steps of `SlipCar-v0` with features observation and random actions, noise and resets
+included; and `evaluate` of an open-loop plan with all its metrics.
+"""
+
+
+def section() -> Section:
+    """All of it, to be printed and kept."""
+    return Section(
+        part="simulation",
+        title="Environment and evaluation",
+        about=ABOUT,
+        tables={
+            "Steps per second by batch size": environment_rows(),
+            "Seconds for 100 000 episodes": evaluation_rows(),
+        },
+    )
 
 
 def environment_rows(seconds: float = 1.0) -> list[dict[str, Any]]:

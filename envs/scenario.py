@@ -285,7 +285,7 @@ class Scenario:
 
     def with_parameters(self, parameters: dict[str, np.ndarray]) -> Scenario:
         """A scenario with these numbers, which may be symbols: not validated."""
-        copy = object.__new__(Scenario)
+        copy = object.__new__(type(self))
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         vars(copy).update({**fields, **parameters})
         return copy
@@ -297,7 +297,7 @@ class Scenario:
 
         Not validated: a car on its way may be inside an obstacle, which no scenario starts in.
         """
-        copy = object.__new__(Scenario)
+        copy = object.__new__(type(self))
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         if start is not None:
             fields["start"] = start

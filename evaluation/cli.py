@@ -14,14 +14,14 @@ from collections.abc import Callable, Sequence
 #: help should not take a second.
 COMMANDS = {
     "compare": ("cli_compare", "compare", "the table and figures: SCP, feedback and PPO"),
-    "plan": ("cli_plan", "plan", "plan one scenario and print how the iteration went"),
+    "plan": ("cli_plan", "plan", "plan one scenario: iterations, certificate, figures"),
     "simulate": ("cli_simulate", "simulate", "drive a few episodes; show, draw or film them"),
     "train": ("cli_train", "train", "train the PPO baseline on a scenario"),
 }
 _DESCRIPTION = """Stochastic SCP, a slipping car, and an honest comparison with PPO.
 
     slipcar compare                      the paper's scenario, five controllers, figures
-    slipcar plan --figure plan.png       one plan, in milliseconds
+    slipcar plan --figures figures       one plan, what it proves, figures
     slipcar COMMAND --help               every option of a command"""
 
 

@@ -39,7 +39,9 @@ def iterations_figure(scenario: Scenario, plan: Any, states: np.ndarray) -> Figu
         plan: a `slipcar.planner.Plan` with its history.
         states: sample paths of the plan, (paths, N, 5).
     """
-    iterates = [iterate for iterate in plan.history if iterate.accepted]
+    over = _times_of_iterates(scenario, plan)
+    accepted = [i for i, iterate in enumerate(plan.history) if iterate.accepted]
+    iterates, over = [plan.history[i] for i in accepted], [over[i] for i in accepted]
     count = len(iterates)
     # Viridis without its palest end, which white paper swallows.
     colours = mpl.colormaps["viridis_r"](np.linspace(0.08, 1.0, count))
@@ -74,15 +76,30 @@ def iterations_figure(scenario: Scenario, plan: Any, states: np.ndarray) -> Figu
         )  # fmt: skip
         for row, column, quantity, component in panels:
             axes = figure.add_subplot(grid[row, column])
-            _draw_over_time(axes, scenario, iterates, colours, quantity, component)
+            _draw_over_time(axes, over, iterates, colours, quantity, component)
+            axes.set_xlim(0.0, max((times[-1] for times in over), default=scenario.horizon))
             if row == 1:
                 axes.set_xlabel("$t$ [s]")
         _iteration_colourbar(figure, colours)
     return figure
 
 
+def _times_of_iterates(scenario: Scenario, plan: Any) -> list[np.ndarray]:
+    """Nodes (N,) of each iterate: under a free final time each belongs to a horizon tried."""
+    tried = [step for step in getattr(plan, "time_search", ()) if step.accepted]
+    horizons = [step.final_time for step in tried for _ in range(step.iterations)]
+    if len(horizons) != len(plan.history):
+        return [scenario.times] * len(plan.history)
+    return [scenario.times * (horizon / scenario.horizon) for horizon in horizons]
+
+
 def _draw_over_time(
-    axes: Axes, scenario: Scenario, iterates: list[Any], colours: Any, quantity: str, index: int
+    axes: Axes,
+    over: list[np.ndarray],
+    iterates: list[Any],
+    colours: Any,
+    quantity: str,
+    index: int,
 ) -> None:
     state = quantity == "mean"
     name = (STATE_NAMES if state else CONTROL_NAMES)[index]
@@ -91,12 +108,11 @@ def _draw_over_time(
         values = getattr(iterate, quantity)[:, index]
         line = {"color": colours[i], "linewidth": 1.6 if i == len(iterates) - 1 else 0.9}
         if state:
-            axes.plot(scenario.times, values, **line)
+            axes.plot(over[i], values, **line)
         else:  # held over each interval: as steps, the last one drawn to its end
-            axes.step(scenario.times, np.append(values, values[-1]), where="post", **line)
+            axes.step(over[i], np.append(values, values[-1]), where="post", **line)
     axes.axhline(0.0, color=GREY, linewidth=0.6, zorder=1)
     axes.set_title(f"${_maths(name)}$ [{unit}]", loc="left")
-    axes.set_xlim(0.0, scenario.horizon)
 
 
 def _maths(name: str) -> str:
@@ -153,7 +169,7 @@ def covariance_figure(scenario: Scenario, plan: Any, states: np.ndarray) -> Figu
             )
             axes.plot(*plan.mean[node, :2], marker="+", color=INK, markersize=8, zorder=7)
             axes.set_aspect("equal", adjustable="datalim")
-            axes.set_title(f"$t$ = {scenario.times[node]:g} s", loc="left")
+            axes.set_title(f"$t$ = {scenario.times[node]:.3g} s", loc="left")
             axes.set_xlabel("$r_x$ [m]")
             axes.set_ylabel("$r_y$ [m]")
         _draw_trace(figure.add_subplot(grid[1, 2]), scenario, plan, states)

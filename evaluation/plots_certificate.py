@@ -1,4 +1,4 @@
-"""Figures of what a plan proves: the Hamiltonian at its maximum, and residuals against time."""
+"""Figure of what a plan proves: the Hamiltonian at its maximum, and the multipliers behind it."""
 
 from __future__ import annotations
 
@@ -11,18 +11,14 @@ from matplotlib.ticker import MaxNLocator
 
 from slipcar.envs.car import CONTROL_NAMES, CONTROL_UNITS
 from slipcar.evaluation.plot_scene import GREY, INK, PALETTE, PAPER, new_figure, style
-from slipcar.planner.certificate import certify, model_for, violations
+from slipcar.planner.certificate import certify, model_for
 from slipcar.planner.maximum_principle import best_step, first_order, hamiltonian
-from slipcar.planner.shooting import START_WITHIN, retry_within, shoot_from
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Array = np.ndarray
-
-#: Residuals below this are rounding errors; the axis ends there.
-_FLOOR = 1e-16
 
 
 def plot_hamiltonian(plan: Any, nodes: Sequence[int] | None = None) -> Figure:
@@ -126,117 +122,3 @@ def _draw_multipliers(axes: Axes, certificate: Any) -> None:
     axes.set_xlabel("iteration $k$")
     axes.set_title("multipliers, normalised", loc="left")
     axes.legend(loc="best")
-
-
-def residuals_of(plan: Any) -> tuple[Array, Array]:
-    """Largest relative residual of the maximum principle at every accepted iterate of SCP.
-
-    Returns:
-        Residuals and the seconds they were reached after, (accepted iterations,) each.
-    """
-    model = model_for(plan)
-    seconds = np.cumsum([h.seconds for h in plan.history])
-    found = [
-        (
-            violations(
-                model,
-                h.mean,
-                h.controls,
-                h.terminal_multiplier,
-                variance_weight=plan.options["variance_weight"],
-                terminal_tolerance=plan.options["terminal_tolerance"],
-            ).largest,
-            s,
-        )
-        for h, s in zip(plan.history, seconds, strict=True)
-        if h.accepted
-    ]
-    values = np.array(found).reshape(-1, 2)
-    return values[:, 0], values[:, 1]
-
-
-def first_shot(
-    plan: Any, start_within: float = START_WITHIN, attempts: int = 4
-) -> tuple[int, Any, float] | None:
-    """The first shot that converges: tried from an iterate whose residual is small enough, and
-    again each time it has halved.
-
-    Args:
-        plan: whose history to start from.
-        start_within: residual at which the first is tried.
-        attempts: at most so many.
-
-    Returns:
-        Index into the history, the shot, and the seconds lost before: in shots that failed and
-        in finding iterates too far away. None if none converges.
-    """
-    limit, lost = start_within, 0.0
-    for k, h in enumerate(plan.history):
-        if not h.accepted or attempts == 0:
-            continue
-        # The fastest of three: one hiccup of the machine is not the method's.
-        shots = [shoot_from(plan, k, start_within=limit) for _ in range(3)]
-        shot = min(shots, key=lambda s: s.seconds)
-        if shot.converged:
-            return k, shot, lost
-        lost += shot.seconds
-        limit = retry_within(shot, limit)
-        attempts -= shot.attempted
-    return None
-
-
-def plot_residuals(
-    plan: Any, others: Sequence[Any] = (), *, start_within: float = START_WITHIN
-) -> Figure:
-    """Residual of the maximum principle against iteration and time: SCP, and SCP + shooting.
-
-    Args:
-        plan: drawn boldly; planned with a small `tolerance`, so that SCP goes on.
-        others: plans of other worlds, drawn faintly.
-        start_within: residual at which shooting is first tried.
-    """
-    with style():
-        figure = new_figure(9.2, 4.0)
-        by_iteration, by_time = figure.subplots(1, 2, sharey=True)
-        for other in others:
-            _draw_residuals(by_iteration, by_time, other, start_within, bold=False)
-        _draw_residuals(by_iteration, by_time, plan, start_within, bold=True)
-        for axes in (by_iteration, by_time):
-            axes.set_yscale("log")
-            axes.set_ylim(_FLOOR, 10.0)
-            axes.set_xlim(left=0.0)
-        by_iteration.set_xlabel("iteration (SCP, then Newton)")
-        by_time.set_xlabel("time [ms]")
-        by_iteration.set_title("residual of the maximum principle", loc="left")
-        by_time.set_title("the same against time", loc="left")
-        by_iteration.xaxis.set_major_locator(MaxNLocator(integer=True))
-        handles, labels = by_iteration.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
-    return figure
-
-
-def _draw_residuals(
-    by_iteration: Axes, by_time: Axes, plan: Any, start_within: float, *, bold: bool
-) -> None:
-    residuals, seconds = residuals_of(plan)
-    look: dict[str, Any] = (
-        {"linewidth": 1.6, "zorder": 5} if bold else {"linewidth": 0.6, "alpha": 0.3, "zorder": 2}
-    )
-    label = "SCP alone" if bold else None
-    steps = np.arange(1, len(residuals) + 1)
-    for axes, x in ((by_iteration, steps), (by_time, 1e3 * seconds)):
-        axes.plot(x, np.maximum(residuals, _FLOOR), color=PALETTE[0], label=label, **look)
-    found = first_shot(plan, start_within)
-    if found is None:
-        return
-    k, shot, lost = found
-    taken = sum(h.accepted for h in plan.history[: k + 1])
-    label = "SCP + shooting" if bold else None
-    marker: dict[str, Any] = {"marker": "o", "markersize": 4} if bold else {}
-    newton = np.maximum(shot.residuals, _FLOOR)
-    after = np.array([h.seconds for h in shot.history])
-    by_iteration.plot(
-        taken + np.arange(len(newton)), newton, color=PALETTE[1], label=label, **look, **marker
-    )
-    began = seconds[taken - 1] + lost
-    by_time.plot(1e3 * (began + after), newton, color=PALETTE[1], **look, **marker)

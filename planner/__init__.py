@@ -4,7 +4,7 @@
     p = plan(problem)                    # any object that satisfies Problem
     action, _ = OpenLoop(p).predict(observation)
 
-Needs NumPy and SciPy alone; numba, where installed, makes it some twenty times faster; the `osqp`
+Needs NumPy and SciPy alone; numba, where installed, compiles it with your dynamics; the `osqp`
 and `cvxpy` backends import their packages when used.
 """
 

@@ -6,9 +6,10 @@ in parallel threads. What cannot be compiled, or does not converge there, is pla
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from slipcar.planner.build import build
 from slipcar.planner.method import (
     compiled_functions,
     driver,
+    is_faithful,
+    newton_options,
     second_chance,
     solve,
     uses_newton,
@@ -31,6 +34,9 @@ from slipcar.planner.reposed import reposed
 from slipcar.planner.warm_start import given_guess
 
 Array = np.ndarray
+
+#: How errors name a problem.
+_LABEL = "problem {} of the batch"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +83,8 @@ def plan_batch(
         out equally.
 
     Raises:
-        TypeError: if a problem lacks a required member, or for an unknown option.
+        TypeError: if a problem lacks a required member, naming its index in the batch, or for an
+            unknown option.
         ValueError: for a wrong option, shape or value, naming its index in the batch.
     """
     began = time.perf_counter()
@@ -89,18 +96,19 @@ def plan_batch(
     if workers != 0:
         check_count("workers", workers)
     models, posed = _models(problems, initial_states, chosen)
+    if guesses is not None and not isinstance(guesses, Sequence):
+        raise TypeError(f"guesses must be a sequence, not {type(guesses).__name__}")
     if guesses is not None and len(guesses) != len(models):
         raise ValueError(f"guesses must be one for each of {len(models)}, not {len(guesses)}")
     tasks = []
     for i, model in enumerate(models):
         given = None if guesses is None else guesses[i]
-        try:
+        with _naming(_LABEL, i):
             x, u = model.guess() if given is None else given_guess(model, given)
             if initial_states is None or i == 0:
                 checks.check_once(model, x, u)
-        except ValueError as error:
-            raise ValueError(f"problem {i} of the batch: {error}") from error
-        first = given is None if free_first is None else bool(free_first)
+        own = given is None and chosen.method != "convex"
+        first = own if free_first is None else bool(free_first)
         tasks.append(Task(model, x, u, first))
     outcomes = solve_tasks(tasks, chosen, workers=workers, history=history)
     record = {**chosen.as_dict(), "free_first": free_first}
@@ -112,16 +120,26 @@ def plan_batch(
 
 
 def solve_tasks(
-    tasks: Sequence[Task], options: Options, *, workers: int = 0, history: bool = True
+    tasks: Sequence[Task],
+    options: Options,
+    *,
+    workers: int = 0,
+    history: bool = True,
+    label: str = _LABEL,
 ) -> list[Outcome]:
-    """Outcomes of all, in order: together where they can be compiled, else one by one."""
+    """Outcomes of all, in order: together where they can be compiled, else one by one.
+
+    Raises:
+        ValueError: as `method.solve`, naming the task by its index in the `label`.
+    """
     found: list[Outcome | None] = [None] * len(tasks)
     if driver() is not None or options.compiled:
         groups: dict[Any, list[tuple[int, Functions]]] = {}
         for i, task in enumerate(tasks):
-            if not uses_newton(task.model, options):
-                continue
-            functions = compiled_functions(task.model, options, task.x, task.u)
+            with _naming(label, i):
+                if not uses_newton(task.model, options):
+                    continue
+                functions = compiled_functions(task.model, options, task.x, task.u)
             if functions is not None:
                 key = (id(functions.kernels), task.x.shape, len(task.model.weight))
                 groups.setdefault(key, []).append((i, functions))
@@ -130,10 +148,23 @@ def solve_tasks(
                 group, _together(tasks, group, options, workers, history), strict=True
             ):
                 found[i] = outcome
-    return [
-        outcome or solve(task.model, options, task.x, task.u, free_first=task.free_first)
-        for task, outcome in zip(tasks, found, strict=True)
-    ]
+    outcomes = []
+    for i, (task, outcome) in enumerate(zip(tasks, found, strict=True)):
+        with _naming(label, i):
+            outcomes.append(
+                outcome or solve(task.model, options, task.x, task.u, free_first=task.free_first)
+            )
+    return outcomes
+
+
+@contextlib.contextmanager
+def _naming(label: str, i: int) -> Iterator[None]:
+    """Errors that say which problem they are about."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = ValueError if isinstance(error, ValueError) else TypeError
+        raise kind(f"{label.format(i)}: {error}") from error
 
 
 def _together(
@@ -143,10 +174,14 @@ def _together(
     workers: int,
     history: bool,
 ) -> list[Outcome | None]:
-    """One call of the compiled iteration; None where a function is not finite along a guess."""
+    """One call of the compiled iteration; None where a problem is better looked at by itself.
+
+    That is where a function is not finite along the guess, or the trace differs at the answer.
+    """
     fast = driver()
     assert fast is not None
     members = [tasks[i] for i, _ in group]
+    limit = newton_options(options).max_iterations
     kernels = group[0][1].kernels
     models = [task.model for task in members]
     if all(
@@ -163,21 +198,23 @@ def _together(
         np.stack([task.u for task in members]),
         variance_weight=options.variance_weight,
         tolerance=options.tolerance,
-        max_iterations=options.max_iterations,
-        keep=options.max_iterations if history else 0,
+        max_iterations=limit,
+        keep=limit if history else 0,
         free_first=np.array([task.free_first for task in members]),
         workers=workers,
     )
     seconds = answers.seconds / len(members)
-    return [
-        second_chance(
-            task.model, options, task.x, task.u,
-            answers.outcome(i, options.variance_weight, seconds),
-        )
-        if answers.finite(i)
-        else None
-        for i, task in enumerate(members)
-    ]  # fmt: skip
+    outcomes: list[Outcome | None] = []
+    for i, task in enumerate(members):
+        outcome = None
+        if answers.finite(i):
+            outcome = answers.outcome(i, options.variance_weight, seconds)
+            if is_faithful(task.model, group[i][1], outcome, native=True):
+                outcome = second_chance(task.model, options, task.x, task.u, outcome)
+            else:
+                outcome = None
+        outcomes.append(outcome)
+    return outcomes
 
 
 def _models(
@@ -185,16 +222,23 @@ def _models(
 ) -> tuple[list[Model], list[Problem]]:
     """Completed problems, and the problems that their plans belong to, in order."""
     if initial_states is None:
-        if not isinstance(problems, Sequence):
+        if not isinstance(problems, Sequence) or isinstance(problems, str):
             raise TypeError(
                 f"problems must be a sequence of problems, or one problem with initial_states, "
                 f"not {type(problems).__name__}"
             )
-        return [_completed(problem, options) for problem in problems], list(problems)
+        models = []
+        for i, problem in enumerate(problems):
+            with _naming(_LABEL, i):
+                models.append(_completed(problem, options))
+        return models, list(problems)
     if isinstance(problems, Sequence):
         raise ValueError("initial_states go with one problem, not with a sequence of problems")
     model = _completed(problems, options)
-    states = np.array(initial_states, dtype=np.float64)
+    try:
+        states = np.array(initial_states, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"initial_states must be numbers, one row for each: {error}") from error
     if states.ndim != 2 or states.shape[1] != model.state_dim:
         raise ValueError(
             f"initial_states must have shape (any, {model.state_dim}), not {states.shape}"

@@ -99,18 +99,25 @@ def free_final_time(
 
     Returns:
         The model at the best horizon, its outcome (MAX_ITERATIONS if the search did not settle at
-        a root of the slope or against a bound), and every horizon tried.
+        a root of the slope or against a bound, STOPPED by the callback), and every horizon tried.
     """
+    if found.status is Status.STOPPED:
+        return model, found, ()
     model, best, steps, settled = _search(model, options, found, time_weight, bounds)
     # Horizons that were not taken are told of in `steps` alone.
     history = tuple(row for step, rows in steps if step.accepted for row in rows)
     tried = sum(step.iterations for step, _ in steps)
     best = dataclasses.replace(best, iterations=tried, history=history)
-    if best.status.ok and not settled:
+    horizon = model.times[-1] - model.times[0]
+    if best.status is Status.STOPPED:
+        return model, best, tuple(step[0] for step in steps)
+    if not best.status.ok:
+        best = best.said(f"none of the horizons tried, up to {horizon:g} s, gave a plan")
+    elif not settled:
         best = dataclasses.replace(best, status=Status.MAX_ITERATIONS).said(
             f"the final time did not settle within {len(steps)} plans"
         )
-    elif best.status.ok and model.times[-1] - model.times[0] in bounds:
+    elif np.isclose(horizon, bounds, rtol=_SHORTEST, atol=0.0).any():
         best = best.said("the final time is at its bound")
     return model, best, tuple(step[0] for step in steps)
 
@@ -144,6 +151,8 @@ def _search(
     # Effort falls with the third power of the horizon where the way is long: a first curvature.
     curvature = 12.0 * max(best.objective - time_weight * T, 0.0) / T**2
     for _ in range(_PLANS):
+        if best.outcome.status is Status.STOPPED:
+            return best.model, best.outcome, steps, False
         if not best.outcome.status.ok:
             if high <= best.T:
                 return best.model, best.outcome, steps, False
@@ -160,6 +169,10 @@ def _search(
             settled = T in bounds or abs(wish) <= radius
             return best.model, best.outcome, steps, settled
         new = at(T, best.outcome.x, best.outcome.u * (best.T / T))
+        if new.outcome.status is Status.STOPPED:
+            steps.append(_step(new, radius, False))
+            stopped = dataclasses.replace(best.outcome, status=Status.STOPPED)
+            return best.model, stopped, steps, False
         noise = _NOISE * abs(best.objective)
         better = new.objective < best.objective - noise or (
             new.objective < best.objective + noise and abs(new.slope) < abs(best.slope)

@@ -46,6 +46,18 @@ class Options:
             raise ValueError(f"compiled must be None, True or False, not {self.compiled!r}")
         if self.compiled and self.callback is not None:
             raise ValueError("compiled=True leaves no room for a callback: leave compiled out")
+        if self.callback is not None and not callable(self.callback):
+            raise ValueError(f"callback must be a function of an Iteration, not {self.callback!r}")
+        if not isinstance(self.solver, str) and not hasattr(self.solver, "solve"):
+            raise ValueError(
+                f"solver must be a name or an object with solve(subproblem), not {self.solver!r}"
+            )
+        convex = self.only_convex or ("method='convex'" if self.method == "convex" else "")
+        if self.compiled and convex:
+            raise ValueError(
+                f"compiled=True is of Newton's method, which cannot be combined with {convex}: "
+                f"leave compiled out"
+            )
         if self.method == "newton" and self.only_convex:
             raise ValueError(
                 f"method='newton' cannot be combined with {self.only_convex}: "

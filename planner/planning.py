@@ -67,7 +67,8 @@ def plan(
             second: another solver, a trust region, the literal linearisation, a terminal box, a
             ball of controls. Where the first does not converge, the second goes on.
         tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0.
-        max_iterations: at most so many sub-problems from each guess, ≥ 1.
+        max_iterations: at most so many sub-problems from each guess, ≥ 1; of those beyond 60
+            three quarters are for the convex method, should Newton's not converge.
         trust_region: of the convex method: `"adaptive"` (None is), `"paper"` (Δ₀ = 100, × 0.99)
             or `"none"`.
         linearization: `"composite"` keeps max(0, ·)² and linearises its argument; `"literal"`
@@ -89,17 +90,19 @@ def plan(
             whether the problem's own guess leads to a better one. `message` says which was taken.
         free_first: leave the penalties out until the first steps have settled, so that the path
             that would be best without obstacles decides which way round them, not the guess.
-            None: where Newton's method starts from the problem's own guess.
+            None: from the problem's own guess, unless method="convex".
         shooting: once an iterate of the convex method is near an extremal, solve the maximum
             principle itself by Newton's method, to 1e-12 (paper §3.3, SPEC §3.8); SCP goes on
             where that fails. `shot` says what became of it.
         free_final_time: choose the horizon too: minimise cost + time_weight · T over a uniform
             dilation of the time grid (paper §5); `final_time` and `time_search` say what came out.
         time_weight: cost of a second of final time, > 0.
-        final_time_bounds: least and largest final time [s]; None is 1/10 and 10 times the
-            problem's.
+        final_time_bounds: least and largest final time [s], counted from the first node; None is
+            1/10 and 10 times the problem's.
         check_derivatives: compare every Jacobian with differences before planning.
-        callback: called with each :class:`Iteration`; returning True stops.
+        callback: called with each :class:`Iteration`, from whichever guess and at whichever
+            horizon; returning True stops that guess (all others begin nonetheless) and any search
+            of a final time.
 
     Returns:
         A plan; look at `status` before using it, and at `message` when it is not CONVERGED.
@@ -110,6 +113,8 @@ def plan(
             that is not affine in the control, or a diffusion that depends on noisy states.
     """
     began = time.perf_counter()
+    if shooting and compiled:
+        raise ValueError("shooting=True watches each iterate: leave compiled=True out")
     if shooting and method == "auto":
         method = "convex"
     options = Options(
@@ -127,6 +132,8 @@ def plan(
     )
     check_count("starts", starts)
     check_choice("cold_start", cold_start, ("auto", "always", "never"))
+    if free_first not in (None, True, False):
+        raise ValueError(f"free_first must be None, True or False, not {free_first!r}")
     if starts > 1 and guess is not None:
         raise ValueError("starts > 1 and guess exclude each other: starts makes its own guesses")
     model = model_of(problem)

@@ -86,7 +86,7 @@ def multistart(
     guesses = initial_guesses(model, count)
     tasks = [Task(model, guess.states, guess.controls, guess.free_first) for guess in guesses]
     # One thread: several would not pay for a handful of problems.
-    outcomes = solve_tasks(tasks, options, workers=1)
+    outcomes = solve_tasks(tasks, options, workers=1, label="guess {}")
     order = sorted(range(len(guesses)), key=lambda i: _rank(outcomes[i]))
     best = order[0]
     classify = getattr(model.problem, "homotopy_class", None)

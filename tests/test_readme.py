@@ -1,4 +1,4 @@
-"""The README's Python runs as printed, and its table is what the command prints."""
+"""The Python of README and docs runs as printed; the README's table is what its command prints."""
 
 import re
 from pathlib import Path
@@ -7,18 +7,38 @@ import pytest
 
 from slipcar.evaluation.cli import main
 
-README = Path(__file__).parent.parent / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def test_readme_has_snippets():
-    assert len(BLOCKS) >= 5
+def blocks(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("index", range(len(BLOCKS)))
-def test_snippet_runs(index, tmp_path, monkeypatch):
+#: Those of the README stand each for itself; those of a page under docs/ go on from one another.
+SCRIPTS = [pytest.param(block, id=f"README-{i}") for i, block in enumerate(blocks(README))]
+SCRIPTS += [
+    pytest.param("\n".join(blocks(page)), id=page.stem) for page in PAGES[1:] if blocks(page)
+]
+
+
+def test_pages_have_snippets():
+    assert len(blocks(README)) >= 5
+    assert len(blocks(ROOT / "docs" / "planner.md")) >= 5
+
+
+@pytest.mark.parametrize("code", SCRIPTS)
+def test_snippets_run(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(compile(BLOCKS[index], f"README.md, snippet {index}", "exec"), {"__name__": "readme"})
+    exec(compile(code, "snippets", "exec"), {"__name__": "snippets"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_files(page):
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8"))
+    here = [link for link in links if "://" not in link]
+    assert [link for link in here if not (page.parent / link).exists()] == []
 
 
 @pytest.mark.long

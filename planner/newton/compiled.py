@@ -11,7 +11,10 @@ neighbours.
 
 from __future__ import annotations
 
+import sys
+import threading
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +22,18 @@ import numba
 import numpy as np
 
 from slipcar.planner.newton.iterate_arrays import (
-    add_curvature,
     covariance,
     evaluate,
     inconsistency,
     lagrangian,
-    semidefinite,
     storage,
+)
+from slipcar.planner.newton.model_arrays import (
+    active_bounds,
+    load,
+    model_cost,
+    quadratic,
+    respond,
 )
 from slipcar.planner.newton.native import ticks
 from slipcar.planner.newton.riccati import solve_lq, workspace
@@ -33,6 +41,8 @@ from slipcar.planner.newton.sweep import sweep
 
 CONVERGED, MAX_ITERATIONS, STALLED, NO_STEP, NOT_FINITE = range(5)
 
+#: Modules the compiled code comes from.
+_SOURCES = ("compiled", "iterate_arrays", "model_arrays", "native", "riccati", "sweep")
 #: Columns of the table that is written, one row for each step tried; the last two are processor
 #: cycles since the beginning.
 COLUMNS = (
@@ -56,152 +66,6 @@ COLUMNS = (
 
 
 @numba.njit(error_model="numpy")
-def _quadratic(
-    addresses, parameters, times, dt, R, weight, w, at, curved, adjoint, nu, Q, q, Rk, r, S
-):  # fmt: skip
-    """The quadratic model at an iterate, hinges and shift left out: see `loop._quadratic`."""
-    ell, d_ell, c, Hx, Hxx = at[5], at[6], at[7], at[10], at[11]
-    x, u, vg, vh = at[14], at[15], at[17], at[18]
-    K, n = q.shape
-    m, p = r.shape[1], c.shape[1]
-    for k in range(K):
-        for i in range(n):
-            q[k, i] = dt[k] * Hx[k, i]
-            for j in range(n):
-                Q[k, i, j] = dt[k] * Hxx[k, i, j]
-        for i in range(m):
-            r[k, i] = dt[k] * ell[k, i]
-            for j in range(m):
-                Rk[k, i, j] = 2.0 * dt[k] * R[i, j]
-                r[k, i] += 2.0 * dt[k] * R[i, j] * u[k, j]
-    S[:] = 0.0
-    if curved:
-        eta = np.empty((K, p))
-        for k in range(K):
-            for o in range(p):
-                eta[k, o] = 2.0 * weight[o] * dt[k] * max(c[k, o], 0.0)
-        add_curvature(addresses, parameters, times, dt, x, u, adjoint, nu, eta, Q, Rk, S)
-    else:
-        for k in range(K):
-            semidefinite(Q[k])
-    for k in range(K - 1):
-        for i in range(n):
-            for j in range(m):
-                q[k, i] += dt[k + 1] * d_ell[k + 1, j, i] * u[k + 1, j]
-            if w > 0.0:
-                q[k, i] += vg[k + 1, i]
-                for j in range(n):
-                    Q[k, i, j] += vh[k + 1, i, j]
-
-
-@numba.njit(error_model="numpy")
-def _load(
-    dt, weight, at, Q, q, Rk, r, shift, kappa, low, high, lower, upper, stiffness, Qs, qs, Rs, rs
-):  # fmt: skip
-    """The LQ problem: the model, hinges that are on, shift, held bounds, terminal curvature."""
-    c, C, g, G, u = at[7], at[8], at[12], at[13], at[15]
-    K, n = q.shape
-    m, p = r.shape[1], c.shape[1]
-    for k in range(K):
-        for i in range(n):
-            qs[k, i] = q[k, i]
-            for j in range(n):
-                Qs[k, i, j] = Q[k, i, j]
-            Qs[k, i, i] += 2.0 * dt[k] * shift
-        for o in range(p):
-            if c[k, o] > 0.0:
-                factor = 2.0 * weight[o] * dt[k]
-                for i in range(n):
-                    a = factor * C[k, o, i]
-                    if a != 0.0:
-                        qs[k, i] += a * c[k, o]
-                        for j in range(n):
-                            Qs[k, i, j] += a * C[k, o, j]
-        for i in range(m):
-            rs[k, i] = r[k, i]
-            for j in range(m):
-                Rs[k, i, j] = Rk[k, i, j]
-            Rs[k, i, i] += 2.0 * dt[k] * shift
-            if high[k, i]:
-                Rs[k, i, i] += stiffness
-                rs[k, i] -= stiffness * (upper[i] - u[k, i])
-            elif low[k, i]:
-                Rs[k, i, i] += stiffness
-                rs[k, i] -= stiffness * (lower[i] - u[k, i])
-    if kappa > 0.0:
-        for j in range(len(g)):
-            for i in range(n):
-                a = kappa * G[j, i]
-                if a != 0.0:
-                    qs[K - 1, i] += a * g[j]
-                    for v in range(n):
-                        Qs[K - 1, i, v] += a * G[j, v]
-
-
-@numba.njit(error_model="numpy")
-def _active_bounds(u, e, lower, upper, low, high, low_new, high_new):
-    """Bounds that the step passes; whether they are those it was computed with."""
-    same = True
-    for k in range(u.shape[0]):
-        for i in range(u.shape[1]):
-            below, above = u[k, i] + e[k, i] < lower[i], u[k, i] + e[k, i] > upper[i]
-            same = same and below == low[k, i] and above == high[k, i]
-            low_new[k, i], high_new[k, i] = below, above
-    return same
-
-
-@numba.njit(error_model="numpy")
-def _respond(A, B, f, u, lower, upper, de, ee):
-    """Clip the controls and let the states follow."""
-    K, n = de.shape
-    for k in range(K):
-        for i in range(ee.shape[1]):
-            ee[k, i] = min(max(u[k, i] + ee[k, i], lower[i]), upper[i]) - u[k, i]
-        for i in range(n):
-            value = f[k, i]
-            if k > 0:
-                for j in range(n):
-                    value += A[k, i, j] * de[k - 1, j]
-            for j in range(ee.shape[1]):
-                value += B[k, i, j] * ee[k, j]
-            de[k, i] = value
-
-
-@numba.njit(error_model="numpy")
-def _model_cost(dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee):
-    """Clip the step; cost by the model there, ∫‖Δu‖² dt and ∫‖Δx‖² dt."""
-    c, C, u, values = at[7], at[8], at[15], at[19]
-    K, n = q.shape
-    m, p = r.shape[1], c.shape[1]
-    cost, step, radius = values[0] + values[2] + values[3], 0.0, 0.0
-    for k in range(K):
-        for i in range(m):
-            ee[k, i] = min(max(u[k, i] + ee[k, i], lower[i]), upper[i]) - u[k, i]
-            step += dt[k] * ee[k, i] * ee[k, i]
-        for i in range(m):
-            inner = r[k, i]
-            for j in range(m):
-                inner += 0.5 * Rk[k, i, j] * ee[k, j]
-            if k > 0:
-                for j in range(n):
-                    inner += S[k, i, j] * de[k - 1, j]
-            cost += inner * ee[k, i]
-        for i in range(n):
-            radius += dt[k] * de[k, i] * de[k, i]
-            inner = q[k, i]
-            for j in range(n):
-                inner += 0.5 * Q[k, i, j] * de[k, j]
-            cost += inner * de[k, i]
-        for o in range(p):
-            value = c[k, o]
-            for i in range(n):
-                value += C[k, o, i] * de[k, i]
-            if value > 0.0:
-                cost += weight[o] * dt[k] * value * value
-    return cost, step, radius
-
-
-@numba.njit(error_model="numpy")
 def _half_largest(array):
     """Half of the largest absolute value."""
     largest = 0.0
@@ -213,7 +77,7 @@ def _half_largest(array):
 @numba.njit(error_model="numpy")
 def _gramian_trace(A, B, dt, R, G):
     """`lq.gramian_trace`."""
-    K, n = A.shape[0], A.shape[1]
+    K = len(A)
     inverse = np.linalg.inv(R)
     Phi, total = G.copy(), 0.0
     for k in range(K - 1, -1, -1):
@@ -286,7 +150,7 @@ def _iterate(
         fallback = rejected >= tuning.rejections
         curved = newton and not fallback
         A, B, f, x, u = at[1], at[2], at[16], at[14], at[15]
-        _quadratic(
+        quadratic(
             addresses, parameters, times, dt, R, weight, w, at, curved, last_adjoint, last_nu,
             Q, q, Rk, r, S,
         )  # fmt: skip
@@ -296,14 +160,14 @@ def _iterate(
         seen = gramian / (1.0 + kappa * gramian) if curved else gramian
         for _ in range(tuning.inertia_trials):
             for bound_round in range(tuning.bound_rounds):
-                _load(
+                load(
                     dt, hinges, at, Q, q, Rk, r, shift if curved else 0.0,
                     kappa if curved else 0.0, low, high, lower, upper, stiffness, Qs, qs, Rs, rs,
                 )  # fmt: skip
                 if addresses[6] != 0:
                     convex = sweep(
-                        addresses, A, B, f, Q_nodes, q_nodes, Rs, rs, S, at[13], at[12], seen, V, gains,
-                        pivots, d_nodes, ee, adjoint, nu,
+                        addresses, A, B, f, Q_nodes, q_nodes, Rs, rs, S, at[13], at[12], seen, V,
+                        gains, pivots, d_nodes, ee, adjoint, nu,
                     )  # fmt: skip
                 else:
                     convex = solve_lq(
@@ -312,7 +176,7 @@ def _iterate(
                 solves += 1
                 if not convex:
                     break
-                same = _active_bounds(u, ee, lower, upper, low, high, low_new, high_new)
+                same = active_bounds(u, ee, lower, upper, low, high, low_new, high_new)
                 if same:
                     break
                 if bound_round < tuning.bound_rounds - 1:
@@ -325,8 +189,8 @@ def _iterate(
             status = NO_STEP
             break
         if not same:
-            _respond(A, B, f, u, lower, upper, de, ee)
-        model, step, radius = _model_cost(dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee)
+            respond(A, B, f, u, lower, upper, de, ee)
+        model, step, radius = model_cost(dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee)
         price, dear = _half_largest(adjoint), _half_largest(nu)
         before, gap, miss = lagrangian(at, adjoint, nu, w, dt, at[20])
         gained, lacking = before - model, price * gap + dear * miss
@@ -410,7 +274,7 @@ def _iterate(
 def _stamp() -> int:
     """A number that changes with any file the compiled code comes from."""
     folder = Path(__file__).parent
-    text = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
+    text = b"".join((folder / f"{name}.py").read_bytes() for name in _SOURCES)
     return zlib.crc32(text)
 
 
@@ -440,3 +304,34 @@ def _compiled(stamp: int) -> Any:
 #: (effort, penalty, running, w ∫ tr Σ dt), the table (P, max_iterations, columns), the
 #: trajectories of each step tried (P, steps to keep, ...), and (how it ended, steps tried).
 solve_many = _compiled(_stamp())
+
+
+_lock = threading.Lock()
+
+
+def prepare(call: Callable[[], None]) -> None:
+    """Compile `solve_many`, or load it from numba's cache on disk, by a call that does nothing.
+
+    Told on stderr where it takes long, which it does once after installation. LLVM's vectoriser
+    would double that time and gains nothing on loops as short as these.
+    """
+    with _lock:
+        if solve_many.signatures:
+            return
+        if not _on_disk():
+            say = "slipcar: compiling the planner (once; kept on disk by numba) ..."
+            print(say, file=sys.stderr, flush=True)
+        config: Any = numba.config
+        before, config.LOOP_VECTORIZE = config.LOOP_VECTORIZE, 0
+        try:
+            call()
+        finally:
+            config.LOOP_VECTORIZE = before
+
+
+def _on_disk() -> bool:
+    """Whether numba's cache has an index for `solve_many`; True where that cannot be told."""
+    try:
+        return Path(solve_many._cache._cache_file._index_path).exists()
+    except AttributeError:  # not a documented place
+        return True

@@ -1,6 +1,6 @@
 """What is known at an iterate, for the compiled iteration: evaluation and sums.
 
-The same quantities as `loop.evaluate` and its neighbours, in arrays that are filled in place. An
+The same quantities as `model.evaluate` and its neighbours, in arrays that are filled in place. An
 iterate is a tuple of arrays; `storage` names its entries. No function here is cached by itself:
 see :mod:`.compiled`.
 """

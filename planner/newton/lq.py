@@ -1,6 +1,7 @@
 """The LQ problem of one iteration in NumPy and LAPACK.
 
-    minimise   Σ_{k=0}^{K-1} ½ e_kᵀR_k e_k + r_kᵀe_k + e_kᵀS_k d_k  +  Σ_{k=1}^{K} ½ d_kᵀQ_k d_k + q_kᵀd_k
+    minimise   Σ_{k=0}^{K-1} ½ e_kᵀR_k e_k + r_kᵀe_k + e_kᵀS_k d_k
+             + Σ_{k=1}^{K}   ½ d_kᵀQ_k d_k + q_kᵀd_k
     s.t.       d_{k+1} = A_k d_k + B_k e_k + f_k,   d_0 = 0,   G d_K + g = 0
 
 Solved as one banded system (:mod:`slipcar.planner.backends.kkt`), in which Q may be indefinite.

@@ -26,6 +26,8 @@ from slipcar.planner.status import Status
 
 Array = np.ndarray
 
+#: Whether the compiled code is loaded.
+_prepared = False
 _STATUS = {
     compiled.CONVERGED: Status.CONVERGED,
     compiled.MAX_ITERATIONS: Status.MAX_ITERATIONS,
@@ -203,7 +205,7 @@ def run(
         """A field of the models, one row for each problem."""
         if len(models) == 1:
             value = getattr(models[0], name)
-            return copied(np.broadcast_to(value, (P, *value.shape)))
+            return copied(value[None] if P == 1 else np.broadcast_to(value, (P, *value.shape)))
         return copied([getattr(model, name) for model in models])
 
     answers = Answers(
@@ -230,7 +232,7 @@ def run(
         answers.covariance, answers.costs, answers.table, *answers.steps, answers.ended,
     ]  # fmt: skip
     fixed = (float(variance_weight), float(tolerance), int(max_iterations), TUNING)
-    first = np.array(np.broadcast_to(free_first, (P,)), dtype=np.bool_)
+    first = np.full(P, free_first, dtype=np.bool_)
 
     def part(where: slice) -> None:
         compiled.solve_many(
@@ -242,6 +244,10 @@ def run(
             *(array[where] for array in (*guesses, *found)),
         )
 
+    global _prepared
+    if not _prepared:
+        compiled.prepare(lambda: part(slice(0, 0)))
+        _prepared = True
     began = time.perf_counter()
     workers = min(workers or os.cpu_count() or 1, P)
     if workers == 1:

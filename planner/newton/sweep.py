@@ -11,7 +11,8 @@ from slipcar.planner.newton.riccati import SOFTNESS, solve_symmetric
 
 @numba.njit(error_model="numpy")
 def sweep(
-    addresses, A, B, f, Q_nodes, q_nodes, R, r, S, G, g, gramian, V, gain, pivot, d_nodes, e, adjoint, nu
+    addresses, A, B, f, Q_nodes, q_nodes, R, r, S, G, g, gramian, V, gain, pivot, d_nodes, e,
+    adjoint, nu,
 ):  # fmt: skip
     """:func:`.riccati.solve_lq` by generated code: see `codegen.recursion`."""
     K, n = f.shape

@@ -54,9 +54,9 @@ def test_all_planners_are_measured_on_all_worlds(worlds, measured):
 
 def test_several_starts_cost_no_more_than_one(worlds, measured):
     found, _ = measured
-    for several, free in zip(found[worlds.SEVERAL], found[worlds.FREE], strict=True):
-        assert several.cost <= free.cost * (1.0 + 1e-6)
-        assert several.iterations > free.iterations
+    for several, one in zip(found[worlds.SEVERAL], found[worlds.SAME], strict=True):
+        assert several.cost <= one.cost * (1.0 + 1e-6)
+        assert several.iterations > one.iterations
     for three, one in zip(found[worlds.IPOPT_BEST], found[worlds.IPOPT], strict=True):
         assert three.cost <= one.cost
         assert three.iterations > one.iterations
@@ -123,10 +123,10 @@ def test_failing_seeds_are_listed_on_both_sides(worlds):
     good = [result(worlds, seed, 1.0) for seed in range(4)]
     ours = [good[0], result(worlds, 1, 2.0), result(worlds, 2, 1.0, miss=1e-3), good[3]]
     theirs = [good[0], good[1], good[2], dataclasses.replace(good[3], converged=False)]
-    names = (worlds.SAME, worlds.FREE, worlds.SEVERAL)
+    names = (worlds.SAME, worlds.DIRECT, worlds.SEVERAL)
     found = dict.fromkeys(names, ours) | dict.fromkeys((worlds.IPOPT, worlds.IPOPT_BEST), theirs)
     lists = worlds.failing(found)
-    same = {what: seeds for what, seeds in lists.items() if worlds.FREE not in what}
+    same = {what: seeds for what, seeds in lists.items() if worlds.DIRECT not in what}
     assert same[f"{worlds.SAME} does not converge to 1e-06"] == [2]
     assert same[f"{worlds.SAME} costs more than 1.02 × {worlds.IPOPT}"] == [1]
     assert same[f"{worlds.IPOPT} does not converge, {worlds.SAME} does"] == [3]

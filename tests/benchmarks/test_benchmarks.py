@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
+from slipcar.planner import plan
+from slipcar.planner.backends import make_solver
 
 pytest.importorskip("casadi", reason='casadi is not installed: pip install "slipcar[bench]"')
 pytest.importorskip("rich")
@@ -47,11 +49,16 @@ def _plan(bench, makers, name):
     [
         "slipcar, numba",
         "slipcar, numba, fine",
+        "slipcar, numba, new scenario",
         "slipcar, NumPy/SciPy",
         "slipcar, NumPy/SciPy, fine",
+        "slipcar, convex scheme",
         "slipcar, OSQP in place",
-        "slipcar, cvxpy + Clarabel SCP",
-        "slipcar, cvxpy + Clarabel SCP, built once",
+        "slipcar, cvxpy + Clarabel",
+        "slipcar, cvxpy + Clarabel, built once",
+        "slipcar, plan_batch, 1 thread",
+        "slipcar, plan_batch, 1 thread, fine",
+        "slipcar, plan_batch, 2 threads",
         "CasADi + fatrop",
         "CasADi + IPOPT",
         "CasADi + IPOPT, not expanded",
@@ -96,8 +103,72 @@ def test_crocoddyl_reaches_the_cost_but_for_its_penalty(bench, makers):
 def test_variance_weight_trades_cost_for_variance(bench, makers):
     _, compiled, judged = _plan(bench, makers, "slipcar, numba, w = 1")
     _, plain, _ = _plan(bench, makers, "slipcar, NumPy/SciPy, w = 1")
+    _, convex, _ = _plan(bench, makers, "slipcar, convex scheme, w = 1")
     assert judged.cost > bench("planners").reference()[1]  # nothing is cheaper than the optimum
     np.testing.assert_allclose(compiled.controls, plain.controls, atol=1e-6)
+    np.testing.assert_allclose(compiled.controls, convex.controls, atol=1e-2)
+
+
+def test_start_states_are_the_own_one_and_others_within_reach(bench):
+    scenario, many = Scenario.named("paper"), bench("many")
+    states = many.start_states(scenario)
+    offsets = states - scenario.start
+    assert states.shape == (1000, 5)
+    np.testing.assert_array_equal(states[0], scenario.start)
+    assert (np.abs(offsets) <= [0.1, 0.1, 0.2, 0.0, 0.0]).all()
+    # Uniform on ±a: standard deviation a/√3, within 10 % over 1000.
+    np.testing.assert_allclose(
+        np.std(offsets[:, :3], axis=0) * np.sqrt(3), [0.1, 0.1, 0.2], rtol=0.1
+    )
+    np.testing.assert_array_equal(states, many.start_states(scenario))
+
+
+def test_a_plan_of_a_batch_takes_its_share_of_the_call(bench):
+    contenders, turns = bench("contenders"), bench("turns")
+    answer = contenders.Answer(np.zeros((40, 2)), 1, True)
+    one = contenders.Contender("one", "", lambda: (0.5, answer))
+    many = contenders.Contender("many", "", lambda: (0.5, answer), plans=1000, threads=2)
+    for contender, ms in ((one, 500.0), (many, 0.5)):
+        timing = turns.Timing(contender, answer, np.array([0.5, 0.5]))
+        assert timing.ms == pytest.approx((ms, ms, ms))
+        assert timing.columns()["fastest"] == pytest.approx(ms)
+    (row,) = bench("many").rows([turns.Timing(c, answer, np.array([0.5])) for c in (one, many)])
+    assert row["ms per plan and core"] == pytest.approx(1.0)
+
+
+class Recorder:
+    """A solver that keeps what it is asked."""
+
+    def __init__(self):
+        self.solver, self.subproblems = make_solver("structured"), []
+
+    def solve(self, sub):
+        self.subproblems.append(sub)
+        return self.solver.solve(sub)
+
+
+def test_parametrised_programme_solves_whatever_sub_problem_comes(bench):
+    # Bounds and penalties come and go within a plan, and the same solver serves the next one.
+    pytest.importorskip("clarabel")
+    recorder = Recorder()
+    for bounds, free_first in ((None, True), ((0.9, 1.2), False)):
+        scenario = Scenario.named("paper").replace(control_bounds=bounds)
+        plan(scenario, variance_weight=0.0, solver=recorder, free_first=free_first)
+    subs = recorder.subproblems
+    assert {sub.bounded for sub in subs} == {True, False}
+    assert {bool(sub.h.any()) for sub in subs} == {True, False}
+    solver, exact = bench("cvxpy_dpp").DppSolver(), make_solver("structured")
+    for i in np.random.default_rng(0).permutation(len(subs)):
+        found, expected = solver.solve(subs[i]), exact.solve(subs[i])
+        assert found.found
+        assert found.objective == pytest.approx(expected.objective, rel=1e-5, abs=1e-5)
+
+
+def test_parametrised_programme_refuses_what_it_cannot_pose(bench):
+    recorder = Recorder()
+    plan(Scenario.named("paper"), variance_weight=1.0, method="convex", solver=recorder)
+    with pytest.raises(ValueError, match="variance_weight"):
+        bench("cvxpy_dpp").DppSolver().solve(recorder.subproblems[0])
 
 
 def test_judge_gives_the_reference_its_cost(bench):

@@ -17,7 +17,23 @@ def test_help_teaches(capsys):
     assert all(name in text for name in COMMANDS)
     options = {
         "compare": ["--episodes", "--seed", "--folder", "--workers", "--policy", "--no-resume"],
-        "plan": ["--variance-weight", "--solver", "--tolerance", "--save", "--figure"],
+        "plan": [
+            "--variance-weight",
+            "--starts",
+            "--guess",
+            "--method",
+            "--compiled",
+            "--shooting",
+            "--free-final-time",
+            "--time-weight",
+            "--integrator",
+            "--solver",
+            "--tolerance",
+            "--save",
+            "--figure",
+            "--figures",
+            "--compare-methods",
+        ],
         "simulate": ["--gif", "--frames", "--human", "feedback", "straight", "ppo"],
         "train": ["--total-steps", "--learning-rate", "--folder", "--seed"],
     }
@@ -38,6 +54,13 @@ def test_help_teaches(capsys):
         (["plan", "--variance-weight", "-1"], "variance_weight must be finite and >= 0"),
         (["plan", "--save", "plan.txt"], "ends in .npz"),
         (["plan", "--figure", "plan.docx"], "ends in .png, .pdf or .svg"),
+        (["plan", "--compare-methods", "plan.docx"], "ends in .png, .pdf or .svg"),
+        (["plan", "--worlds", "-1"], "worlds must be >= 0"),
+        (["plan", "--starts", "0"], "starts must be an integer >= 1"),
+        (["plan", "--guess", "missing.npz"], "missing.npz"),
+        (["plan", "--free-final-time", "--time-weight", "0"], "time_weight must be finite and > 0"),
+        (["plan", "--free-final-time", "--final-time-bounds", "3", "2"], "final_time_bounds"),
+        (["plan", "--method", "newton", "--trust-region", "paper"], "method='convex' can"),
         (["simulate", "uber"], "unknown controller 'uber'"),
         (["simulate", "missing.npz"], "missing.npz"),
         (["simulate", "scp", "--episodes", "0"], "episodes must be at least 1, not 0"),
@@ -76,8 +99,44 @@ def test_plan_prints_saves_and_draws(tmp_path, capsys):
     assert "CONVERGED" in text
     assert f"effort {expected.effort:.6f}" in text
     assert f"{expected.iterations} iterations" in text
+    assert str(expected.certificate) in text
     np.testing.assert_array_equal(Plan.load(saved).controls, expected.controls)
     assert "<svg" in figure.read_text(encoding="utf-8")
+
+
+def test_plan_tells_of_every_guess(capsys):
+    assert main(["plan", "--starts", "4"]) == 0
+    text = capsys.readouterr().out
+    rows = plan(Scenario.named("paper"), starts=4).alternatives
+    assert len(rows) == 4
+    assert all(row.label in text and f"{row.cost:.6f}" in text for row in rows)
+
+
+def test_plan_tells_of_every_horizon_and_starts_from_an_earlier_plan(tmp_path, capsys):
+    saved = tmp_path / "plan.npz"
+    assert main(["plan", "--free-final-time", "--time-weight", "2", "--save", str(saved)]) == 0
+    text = capsys.readouterr().out
+    found = Plan.load(saved)
+    assert len(found.time_search) > 2
+    assert all(f"{row.final_time:.6f}" in text for row in found.time_search)
+    assert f"final time {found.final_time:.6f} s" in text
+    assert main(["plan", "--guess", str(saved)]) == 0
+    expected = plan(Scenario.named("paper"), guess=found)
+    assert f"effort {expected.effort:.6f}" in capsys.readouterr().out
+
+
+def test_plan_tells_of_the_shot(capsys):
+    assert main(["plan", "--shooting"]) == 0
+    assert "shooting: converged" in capsys.readouterr().out
+
+
+def test_plan_draws_what_it_proves_and_compares_methods(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    compared = tmp_path / "residuals.svg"
+    arguments = ["--figures", str(tmp_path), "--compare-methods", str(compared), "--worlds", "1"]
+    assert main(["plan", *arguments]) == 0
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"iterations.png", "covariance.pdf", "hamiltonian.png", "residuals.svg"} <= names
 
 
 def test_a_plan_that_does_not_converge_is_exit_code_1(capsys):

@@ -6,14 +6,13 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.patches import Circle, Ellipse
 
+from slipcar.envs import Scenario
 from slipcar.evaluation import compare, plots, sample_paths
 from slipcar.planner import OpenLoop, plan
 
 
 @pytest.fixture(scope="module")
 def planned():
-    from slipcar.envs import Scenario
-
     scenario = Scenario.named("paper")
     found = plan(scenario)
     states, _ = sample_paths(OpenLoop(found), scenario, 4096)
@@ -129,3 +128,14 @@ def test_paths_that_hit_are_counted(planned):
     hit = int((scenario.signed_distance(states[:500, 1:]) < 0).any(axis=1).sum())
     assert hit > 0
     assert {f"hits an obstacle ({hit})", f"free ({500 - hit})"} <= set(labels)
+
+
+def test_iterates_of_a_free_final_time_end_when_their_horizons_do():
+    found = plan(Scenario.named("paper"), free_final_time=True)
+    states, _ = sample_paths(OpenLoop(found), found.problem, 2)
+    axes = plots.iterations_figure(found.problem, found, states).axes[1]
+    ends = [line.get_xdata()[-1] for line in axes.lines if len(line.get_xdata()) == 41]
+    tried = [step for step in found.time_search if step.accepted]
+    expected = np.repeat([t.final_time for t in tried], [t.iterations for t in tried])
+    assert len({step.final_time for step in tried}) > 2
+    np.testing.assert_allclose(ends, expected)

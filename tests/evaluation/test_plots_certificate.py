@@ -4,12 +4,9 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from slipcar.envs import Scenario
-from slipcar.evaluation.plots_certificate import (
-    first_shot,
-    plot_hamiltonian,
-    plot_residuals,
-    residuals_of,
-)
+from slipcar.evaluation.plots_certificate import plot_hamiltonian
+from slipcar.evaluation.plots_residuals import plot_residuals
+from slipcar.evaluation.residuals import Curve
 from slipcar.planner import plan
 from slipcar.planner.certificate import certify
 
@@ -57,27 +54,26 @@ def test_nodes_that_are_none_are_refused(planned, nodes):
         plot_hamiltonian(planned, nodes=nodes)
 
 
-def test_residual_curves_are_those_of_the_certificate(planned):
-    residuals, seconds = residuals_of(planned)
-    assert len(residuals) == sum(h.accepted for h in planned.history)
-    assert np.all(np.diff(seconds) > 0.0)
-    c = certify(planned)
-    assert residuals[-1] == pytest.approx(c.violations.largest)
-    k, shot, lost = first_shot(planned)
-    assert lost >= 0.0
-    assert shot.residuals[0] == pytest.approx(residuals[k], rel=1e-6)
-    assert shot.residual <= 1e-12
-    figure = plot_residuals(planned, [plan(Scenario.random(4), tolerance=1e-8)])
+def curve(*residuals):
+    count = np.arange(1, len(residuals) + 1)
+    return Curve(np.array(residuals), count, 1e-3 * count)
+
+
+def test_residuals_are_drawn_against_iteration_and_time():
+    bold = {"convex": curve(1.0, 0.1, 1e-20), "newton": curve(1.0, 1e-9)}
+    bold["newton, NumPy"] = curve(1.0, 1e-9)
+    figure = plot_residuals(bold, [{"convex": curve(2.0, 0.2)}])
     by_iteration, by_time = figure.axes
-    alone, together = by_iteration.lines[-2:]
-    np.testing.assert_array_equal(alone.get_ydata(), residuals)
-    np.testing.assert_array_equal(together.get_ydata(), np.maximum(shot.residuals, 1e-16))
-    assert together.get_xdata()[0] == k + 1
-    assert len(by_time.lines) == len(by_iteration.lines) == 4
+    assert len(by_iteration.lines) == 3  # the uncompiled iterates are the same
+    assert len(by_time.lines) == 4
+    faint, convex, _ = by_iteration.lines
+    np.testing.assert_array_equal(faint.get_ydata(), [2.0, 0.2])
+    np.testing.assert_array_equal(convex.get_ydata(), [1.0, 0.1, 1e-16])  # the axis ends there
+    np.testing.assert_allclose(by_time.lines[1].get_xdata(), [1.0, 2.0, 3.0])  # ms
     assert by_iteration.get_yscale() == "log"
+    assert len(figure.legends[0].get_texts()) == 3
 
 
-def test_a_plan_that_no_shot_improves_is_drawn_alone():
-    stuck = plan(Scenario.named("paper").replace(control_bounds=(0.1, 0.1)), max_iterations=5)
-    assert first_shot(stuck) is None
-    assert len(plot_residuals(stuck).axes[0].lines) == 1
+def test_unknown_methods_are_refused():
+    with pytest.raises(ValueError, match="guessing"):
+        plot_residuals({"guessing": curve(1.0)})
