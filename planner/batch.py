@@ -107,7 +107,7 @@ def plan_batch(
             x, u = model.guess() if given is None else given_guess(model, given)
             if initial_states is None or i == 0:
                 checks.check_once(model, x, u)
-        own = given is None and chosen.method != "convex"
+        own = given is None and chosen.method != "convex" and not chosen.only_convex
         first = own if free_first is None else bool(free_first)
         tasks.append(Task(model, x, u, first))
     outcomes = solve_tasks(tasks, chosen, workers=workers, history=history)

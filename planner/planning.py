@@ -90,7 +90,7 @@ def plan(
             whether the problem's own guess leads to a better one. `message` says which was taken.
         free_first: leave the penalties out until the first steps have settled, so that the path
             that would be best without obstacles decides which way round them, not the guess.
-            None: from the problem's own guess, unless method="convex".
+            None: from the problem's own guess, unless an option asks for the convex method.
         shooting: once an iterate of the convex method is near an extremal, solve the maximum
             principle itself by Newton's method, to 1e-12 (paper §3.3, SPEC §3.8); SCP goes on
             where that fails. `shot` says what became of it.
@@ -154,11 +154,13 @@ def plan(
         "shooting": bool(shooting),
         "free_final_time": bool(free_final_time),
         "time_weight": float(time_weight) if free_final_time else None,
+        "final_time_bounds": list(bounds) if free_final_time else None,
     }
     more: dict[str, Any] = {}
+    convex = method == "convex" or bool(options.only_convex)
 
     def run(x: Array, u: Array, *, own: bool = False) -> Outcome:
-        first = own and method != "convex" if free_first is None else free_first
+        first = own and not convex if free_first is None else free_first
         if shooting:
             found, more["shot"] = solve_shooting(model, options, x, u, free_first=first)
             return found

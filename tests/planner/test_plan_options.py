@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+import subprocess
 import sys
 import threading
 
@@ -260,7 +261,7 @@ def test_stopping_a_search_of_the_final_time_keeps_the_best_plan(paper):
 
     p = plan(paper, free_final_time=True, callback=stop)
     assert p.status is Status.STOPPED
-    assert len(seen) == first + 9
+    assert first + 9 <= len(seen) <= first + 10  # one more where that one converged
     assert p.times[-1] == p.problem.times[-1]
     np.testing.assert_allclose(p.mean[-1], paper.goal, atol=1e-6)
 
@@ -309,21 +310,24 @@ def test_what_cannot_be_traced_says_why():
         plan(Branching(), compiled=True)
 
 
-def test_compiled_without_numba_says_what_to_install(paper, monkeypatch):
-    from slipcar.planner import method
-
-    monkeypatch.delitem(sys.modules, "slipcar.planner.newton.run", raising=False)
-    monkeypatch.delattr("slipcar.planner.newton.run", raising=False)
-    monkeypatch.setitem(sys.modules, "numba", None)
-    for name in ("compiled", "iterate_arrays", "riccati", "sweep", "native", "model_arrays"):
-        monkeypatch.delitem(sys.modules, f"slipcar.planner.newton.{name}", raising=False)
-    method.driver.cache_clear()
+def test_compiled_without_numba_says_what_to_install():
+    code = """
+import sys
+sys.modules["numba"] = sys.modules["llvmlite"] = None
+from slipcar.envs import Scenario
+from slipcar.planner import plan, plan_batch
+paper = Scenario.named("paper")
+assert plan(paper).status.ok and plan_batch([paper])[0].status.ok
+for call in (lambda: plan(paper, compiled=True), lambda: plan_batch([paper], compiled=True)):
     try:
-        assert plan(paper).status.ok
-        with pytest.raises(ImportError, match=r'pip install "slipcar\[fast\]"'):
-            plan(paper, compiled=True)
-    finally:
-        method.driver.cache_clear()
+        call()
+    except ImportError as error:
+        print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (
+        done.stdout.splitlines() == ['compiled=True needs numba: pip install "slipcar[fast]"'] * 2
+    )
 
 
 # --------------------------------------------------------------------- time grids, units, copies
