@@ -48,6 +48,7 @@ solver's own.
 
 #: Rows that owe nothing to another solver.
 _OWN = ("slipcar, numba", "slipcar, NumPy", "slipcar, convex scheme, w", "slipcar, plan_batch")
+_WHOLE = ("CasADi", "crocoddyl", "OpenSCvx")
 _REFERENCE = Path(__file__).resolve().parent.parent / "tests" / "data" / "paper_case.json"
 #: Contenders by module: those of a package that is not installed are skipped.
 _MODULES = ("cvxpy_dpp", "casadi_nlp", "paper_recipe")
@@ -146,19 +147,29 @@ def ratios(timings: list[Timing]) -> list[dict[str, Any]]:
 
     Both sides have met the problem before: theirs is built, ours is remembered.
     """
-    median = {timing.contender.name: timing.ms[1] for timing in timings}
-    whole = [name for name in median if name.startswith(("CasADi", "crocoddyl", "OpenSCvx"))]
-    if not whole:
-        return []
-    mine = [timing for timing in timings if timing.contender.name.startswith(_OWN)]
+    whole = [t for t in timings if t.contender.name.startswith(_WHOLE)]
+    mine = [
+        t
+        for t in timings
+        if t.contender.name.startswith(_OWN)
+        and t.contender.threads == 1
+        and "new scenario" not in t.contender.name
+    ]
     return [
         {
-            "planner": f"{timing.contender.name}, {timing.contender.tolerance}",
-            **{name: median[name] / timing.ms[1] for name in whole},
+            "planner": f"{one.contender.name}, {one.contender.tolerance}",
+            **{other.contender.name: ratio(other, one) for other in whole},
         }
-        for timing in sorted(mine, key=lambda timing: timing.ms[1])
-        if timing.contender.threads == 1 and "new scenario" not in timing.contender.name
+        for one in sorted(mine, key=lambda timing: timing.ms[1])
+        if whole
     ]
+
+
+def ratio(theirs: Timing, ours: Timing) -> float:
+    """Of the medians per plan, over the rounds that both took part in: the early ones."""
+    both = min(len(theirs.seconds), len(ours.seconds))
+    a, b = (float(np.median(t.seconds[:both])) / t.contender.plans for t in (theirs, ours))
+    return a / b
 
 
 def _makers_of(module: str, scenario: Scenario) -> dict[str, Callable[[], Contender]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, overload
 
 import numpy as np
@@ -69,10 +69,26 @@ class Columns(Sequence[Iteration]):
     """A history kept as one array for each field of :class:`Iteration`, its rows first.
 
     The compiled iteration writes columns; most users never look at a row.
+
+    Args:
+        columns: by field, or a function that makes them when they are first looked at.
+        rows: how many there are; None counts them.
     """
 
-    def __init__(self, columns: dict[str, Array]) -> None:
-        self.columns = columns
+    def __init__(
+        self, columns: dict[str, Array] | Callable[[], dict[str, Array]], rows: int | None = None
+    ) -> None:
+        self._columns, self._rows = columns, rows
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """One array for each field, rows first."""
+        if callable(self._columns):
+            self._columns = self._columns()
+        return self._columns
+
+    def __reduce__(self) -> tuple[type[Columns], tuple[dict[str, Array]]]:
+        return Columns, (self.columns,)
 
     @classmethod
     def of(cls, rows: Sequence[Iteration]) -> Columns:
@@ -83,7 +99,7 @@ class Columns(Sequence[Iteration]):
         return cls({name: np.stack([getattr(row, name) for row in rows]) for name in names})
 
     def __len__(self) -> int:
-        return len(self.columns["effort"])
+        return len(self.columns["effort"]) if self._rows is None else self._rows
 
     @overload
     def __getitem__(self, index: int) -> Iteration: ...

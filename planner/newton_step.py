@@ -19,7 +19,6 @@ import dataclasses
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import lapack
 
 from slipcar.planner.maximum_principle import FirstOrder
 from slipcar.planner.second_order import SecondOrder
@@ -133,6 +132,8 @@ class NewtonSystem:
         flat[layout.G] = np.where(held[:, None], G, 0.0)
         flat[layout.nu] = np.where(held, 0.0, 1.0)
         self._width = layout.width
+        from scipy.linalg import lapack  # here: plans that do not shoot need no SciPy
+
         self._factors, self._pivots, info = lapack.dgbtrf(
             band.T, layout.width, layout.width, overwrite_ab=True
         )
@@ -153,6 +154,8 @@ class NewtonSystem:
         right = self._right.copy()
         right[: 2 * n * K].reshape(K, 2, n)[:, 1] -= push
         w = self._width
+        from scipy.linalg import lapack
+
         found, _ = lapack.dgbtrs(self._factors, w, w, right, self._pivots, overwrite_b=True)
         blocks = found[: 2 * n * K].reshape(K, 2, n)
         adjoint, d = blocks[:, 0], blocks[:, 1]

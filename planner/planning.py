@@ -79,8 +79,9 @@ def plan(
         compiled: run Newton's method compiled by numba, the same steps to rounding errors. None:
             where numba is installed and the problem's functions can be traced, and no callback
             is to be called on the way.
-        starts: guesses to try, ≥ 1: the problem's own and others round the obstacles; the best
-            plan is returned and `alternatives` says what became of each.
+        starts: guesses to try, ≥ 1: the problem's own (with and without its penalties at first) and
+            others round the obstacles; the best plan is returned and `alternatives` says what
+            became of each.
         guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
             and controls (N−1, m); None takes the problem's own.
         cold_start: when the problem's own guess is tried beside `guess` and the better plan

@@ -1,6 +1,6 @@
 """Several guesses, the best plan: which way round the obstacles is a question for enumeration.
 
-    guesses: the problem's own, without penalties first; then what the problem offers
+    guesses: the problem's own, without penalties first and with them; then what the problem offers
              (`problem.guesses`), else smooth random bumps of its own
     answer:  of the converged outcomes the one of least cost + w ∫ tr Σ dt
 
@@ -51,6 +51,8 @@ class Guess:
 def initial_guesses(model: Model, count: int) -> list[Guess]:
     """Up to `count` guesses, the most promising first; the problem's own is the first.
 
+    Where there are penalties it is there twice, without them first and as it is.
+
     Args:
         model: the completed problem.
         count: at least 1. Fewer come back only if the problem offers fewer. An optional member
@@ -65,6 +67,9 @@ def initial_guesses(model: Model, count: int) -> list[Guess]:
     """
     x, u = model.guess()
     found = [Guess("own", x, u, free_first=True)]
+    if model.weight.any():
+        found.append(Guess("own, penalties in", x, u))
+        count += 1  # the own one counts once, though it is tried both ways
     for label, states, controls in _others(model, x, u, int(count)):
         if len(found) >= count:
             break

@@ -16,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.linalg import lapack
 
 from slipcar.planner.convexify import Subproblem
 
@@ -152,6 +151,8 @@ class BandedKkt:
             blocks[:, 0] -= (sub.B @ offset[..., None])[..., 0]
         np.negative(linear, out=blocks[:, 1])
         right[2 * n * K :, 0] = nu_right
+        from scipy.linalg import lapack  # here: compiled plans do without SciPy's import time
+
         w = self.width
         _, _, solution, info = lapack.dgbsv(
             w, w, band.T, right, overwrite_ab=True, overwrite_b=True

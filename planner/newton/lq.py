@@ -19,7 +19,6 @@ import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
-from scipy.linalg import lapack
 
 from slipcar.planner.backends.kkt import BandedKkt
 
@@ -158,4 +157,6 @@ class _Inertia:
         band = band.reshape(self._size, self._width).T
         if not np.isfinite(largest):
             return False
+        from scipy.linalg import lapack  # here: compiled plans do without SciPy's import time
+
         return lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0

@@ -104,6 +104,12 @@ class Answers:
         if self.steps[0].shape[1] == 0:
             return ()
         kept = min(tried, self.steps[0].shape[1])
+        return Columns(lambda: self._columns(i, kept, variance_weight, seconds), kept)
+
+    def _columns(
+        self, i: int, kept: int, variance_weight: float, seconds: float
+    ) -> dict[str, Array]:
+        """The fields of the first steps of problem i."""
         table = self.table[i, :kept]
         column = {name: table[:, j] for j, name in enumerate(compiled.COLUMNS)}
         weight = variance_weight if variance_weight > 0.0 else np.nan
@@ -112,30 +118,28 @@ class Answers:
         per_tick = seconds / ends[-1] if kept and ends[-1] > 0 else 0.0
         started = np.append(0.0, solved[:-1])
         x, u, nu = (array[i, :kept] for array in self.steps)
-        return Columns(
-            {
-                "mean": x,
-                "controls": u,
-                "effort": column["effort"],
-                "penalty": column["penalty"],
-                "running": column["running"],
-                "variance": column["variance"] / weight,
-                "merit": column["merit"],
-                "predicted": column["predicted"],
-                "actual": column["actual"],
-                "step": column["step"],
-                "trust_radius": column["radius"],
-                "trust_multiplier": column["shift"],
-                "virtual_control": np.zeros(kept),
-                "defect": column["defect"],
-                "terminal_residual": column["terminal_residual"],
-                "terminal_multiplier": nu,
-                "accepted": column["accepted"] > 0.0,
-                "solver_iterations": column["solves"].astype(np.int64),
-                "linearize_seconds": per_tick * (began - started),
-                "solve_seconds": per_tick * (solved - began),
-            }
-        )
+        return {
+            "mean": x,
+            "controls": u,
+            "effort": column["effort"],
+            "penalty": column["penalty"],
+            "running": column["running"],
+            "variance": column["variance"] / weight,
+            "merit": column["merit"],
+            "predicted": column["predicted"],
+            "actual": column["actual"],
+            "step": column["step"],
+            "trust_radius": column["radius"],
+            "trust_multiplier": column["shift"],
+            "virtual_control": np.zeros(kept),
+            "defect": column["defect"],
+            "terminal_residual": column["terminal_residual"],
+            "terminal_multiplier": nu,
+            "accepted": column["accepted"] > 0.0,
+            "solver_iterations": column["solves"].astype(np.int64),
+            "linearize_seconds": per_tick * (began - started),
+            "solve_seconds": per_tick * (solved - began),
+        }
 
 
 def solve_one(

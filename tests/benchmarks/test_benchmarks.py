@@ -136,6 +136,16 @@ def test_a_plan_of_a_batch_takes_its_share_of_the_call(bench):
     assert row["ms per plan and core"] == pytest.approx(1.0)
 
 
+def test_ratio_is_over_the_rounds_that_both_took_part_in(bench):
+    contenders, turns = bench("contenders"), bench("turns")
+    answer = contenders.Answer(np.zeros((40, 2)), 1, True)
+    one = contenders.Contender("one", "", lambda: (0.5, answer))
+    many = contenders.Contender("many", "", lambda: (0.5, answer), plans=10)
+    theirs = turns.Timing(one, answer, np.array([1.0, 1.0, 1.0, 7.0, 7.0, 7.0, 7.0]))
+    ours = turns.Timing(many, answer, np.array([2.0, 2.0, 2.0]))
+    assert bench("planners").ratio(theirs, ours) == pytest.approx(5.0)
+
+
 class Recorder:
     """A solver that keeps what it is asked."""
 
