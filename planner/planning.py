@@ -66,7 +66,8 @@ def plan(
             sub-problems. `"auto"` takes the first unless an option or the problem asks for the
             second: another solver, a trust region, the literal linearisation, a terminal box, a
             ball of controls. Where the first does not converge, the second goes on.
-        tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0.
+        tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0; in the
+            units of the controls: choose it for controls that are not of order one.
         max_iterations: at most so many sub-problems from each guess, ≥ 1; of those beyond 60
             three quarters are for the convex method, should Newton's not converge.
         trust_region: of the convex method: `"adaptive"` (None is), `"paper"` (Δ₀ = 100, × 0.99)
