@@ -1,7 +1,6 @@
 """The examples run as printed, and their systems against closed forms, SciPy and Monte Carlo."""
 
 import importlib.util
-import inspect
 import math
 import runpy
 import sys
@@ -19,10 +18,6 @@ from slipcar.planner.problem import model_of
 
 FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(path.stem for path in FOLDER.glob("*.py"))
-needs_free_time = pytest.mark.skipif(
-    "free_final_time" not in inspect.signature(plan).parameters,
-    reason="plan() has no free_final_time yet",
-)
 
 
 def load(name):
@@ -42,10 +37,7 @@ SYSTEMS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(e, marks=needs_free_time if e == "free_time" else ()) for e in EXAMPLES],
-)
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_example_runs_and_converges(name, capsys):
     runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     printed = capsys.readouterr().out
@@ -213,7 +205,6 @@ def spread_of(times, s):
 GRIDS = {"even": np.linspace(0.0, 5.0, 51), "uneven": 3.0 * np.linspace(0.0, 1.0, 26) ** 1.4}
 
 
-@needs_free_time
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize(("c", "w"), [(0.1, 0.0), (1.0, 0.0), (10.0, 0.0), (1.0, 10.0)])
 def test_free_final_time_is_the_closed_form(c, w, grid):
@@ -240,7 +231,6 @@ def test_free_final_time_is_the_closed_form(c, w, grid):
         assert abs(p.certificate.transversality) < 1e-5 * c
 
 
-@needs_free_time
 def test_free_final_time_nears_the_textbook():
     Hoist = load("free_time").Hoist
     errors = []

@@ -1,6 +1,5 @@
 """Free final time on the car against IPOPT on the whole problem (data/make_free_time.py)."""
 
-import inspect
 import json
 from pathlib import Path
 
@@ -16,10 +15,6 @@ DATA = json.loads(
 )
 CASES = DATA["cases"]
 OPTIONS = {"variance_weight": 0.0, "tolerance": 1e-10}
-needs_option = pytest.mark.skipif(
-    "free_final_time" not in inspect.signature(plan).parameters,
-    reason="plan() has no free_final_time yet",
-)
 
 
 def scenario_of(case):
@@ -53,7 +48,6 @@ def test_a_plan_at_the_best_horizon_meets_the_reference(name):
     assert found.extremal
 
 
-@needs_option
 @pytest.mark.parametrize("name", CASES)
 def test_free_final_time_meets_the_reference(name):
     case = CASES[name]
@@ -66,7 +60,6 @@ def test_free_final_time_meets_the_reference(name):
     assert p.certificate.extremal
 
 
-@needs_option
 @pytest.mark.parametrize("horizon", [2.5, 4.0, 8.0])
 def test_the_first_horizon_does_not_matter(horizon):
     # On the paper's case IPOPT comes to the same T from wherever it starts.
@@ -75,7 +68,6 @@ def test_the_first_horizon_does_not_matter(horizon):
     agree(plan(s, free_final_time=True, time_weight=4.0, **OPTIONS), case)
 
 
-@needs_option
 def test_with_noise_the_horizon_is_a_minimum_over_fixed_ones():
     s, c, w = Scenario.named("paper"), 1.0, 5.0
     free = plan(s, free_final_time=True, time_weight=c, variance_weight=w, tolerance=1e-10)
@@ -94,7 +86,6 @@ def test_with_noise_the_horizon_is_a_minimum_over_fixed_ones():
     assert beside[1] < min(beside[0], beside[2])
 
 
-@needs_option
 def test_time_costs_make_haste():
     times = [
         plan(Scenario.named("open"), free_final_time=True, time_weight=c).final_time
