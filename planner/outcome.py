@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from slipcar.planner import moments
+from slipcar.planner.convexify import Linearization
 from slipcar.planner.history import Iteration
 from slipcar.planner.status import Status
 
@@ -52,6 +54,42 @@ class Outcome:
     history: Sequence[Iteration]
     objective: float
     message: str = ""
+
+    @classmethod
+    def at(
+        cls,
+        lin: Linearization,
+        dt: Array,
+        variance_weight: float,
+        *,
+        status: Status,
+        adjoint: Array,
+        terminal: Array,
+        history: Sequence[Iteration],
+        trust_multiplier: float = 0.0,
+        message: str = "",
+    ) -> Outcome:
+        """What is known where an iteration ended, from its linearisation there."""
+        S = moments.covariance(lin.A, lin.sigma, dt)
+        variance = variance_weight * moments.trace_integral(S, dt)
+        return cls(
+            status=status,
+            x=lin.x,
+            u=lin.u,
+            A=lin.A,
+            B=lin.B,
+            covariance=S,
+            effort=lin.effort,
+            penalty=lin.penalty,
+            running=lin.running,
+            adjoint=adjoint,
+            terminal=terminal,
+            trust_multiplier=trust_multiplier,
+            iterations=len(history),
+            history=history,
+            objective=lin.effort + lin.penalty + lin.running + variance,
+            message=message,
+        )
 
     def said(self, words: str) -> Outcome:
         """The same with more to say."""

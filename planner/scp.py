@@ -106,23 +106,15 @@ def _attempt(
         nonlocal at
         if not status.ok and not np.array_equal(inside := model.admissible(at.lin.u), at.lin.u):
             at = iterate_at(model, options.variance_weight, at.lin.x, inside)
-        lin = at.lin
-        return Outcome(
+        return Outcome.at(
+            at.lin,
+            model.dt,
+            options.variance_weight,
             status=status,
-            x=lin.x,
-            u=lin.u,
-            A=lin.A,
-            B=lin.B,
-            covariance=moments.covariance(lin.A, lin.sigma, model.dt),
-            effort=lin.effort,
-            penalty=lin.penalty,
-            running=lin.running,
             adjoint=adjoint,
             terminal=terminal,
-            trust_multiplier=multiplier,
-            iterations=len(history),
             history=tuple(history),
-            objective=lin.effort + lin.penalty + lin.running + at.variance_value(),
+            trust_multiplier=multiplier,
             message=message,
         )
 

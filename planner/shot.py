@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner import moments
 from slipcar.planner.history import Iteration
 from slipcar.planner.method import solve
 from slipcar.planner.options import Options
@@ -56,24 +55,8 @@ def solve_shooting(
     )
     if last is None or not last.converged:
         return found, last
-    lin = last.at
-    S = moments.covariance(lin.A, lin.sigma, model.dt)
-    variance = options.variance_weight * moments.trace_integral(S, model.dt)
-    hit = Outcome(
-        status=Status.CONVERGED,
-        x=lin.x,
-        u=lin.u,
-        A=lin.A,
-        B=lin.B,
-        covariance=S,
-        effort=lin.effort,
-        penalty=lin.penalty,
-        running=lin.running,
-        adjoint=last.adjoint,
-        terminal=last.terminal,
-        trust_multiplier=0.0,
-        iterations=found.iterations,
-        history=found.history,
-        objective=lin.effort + lin.penalty + lin.running + variance,
-    )
+    hit = Outcome.at(
+        last.at, model.dt, options.variance_weight, status=Status.CONVERGED,
+        adjoint=last.adjoint, terminal=last.terminal, history=found.history,
+    )  # fmt: skip
     return hit, last

@@ -36,9 +36,8 @@ import time
 
 import numpy as np
 
-from slipcar.planner import moments
 from slipcar.planner.convexify import Linearization
-from slipcar.planner.feasibility import not_finite
+from slipcar.planner.feasibility import inconsistency, not_finite
 from slipcar.planner.history import Iteration
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.lq import LqSolution, LqSolver, gramian_trace
@@ -181,24 +180,10 @@ def iterate(
         if stop:
             status = Status.STOPPED
             break
-    lin = at.lin
-    return Outcome(
-        status=status,
-        x=lin.x,
-        u=lin.u,
-        A=lin.A,
-        B=lin.B,
-        covariance=moments.covariance(lin.A, lin.sigma, model.dt),
-        effort=lin.effort,
-        penalty=lin.penalty,
-        running=lin.running,
-        adjoint=adjoint,
-        terminal=terminal,
-        trust_multiplier=0.0,
-        iterations=len(history),
+    return Outcome.at(
+        at.lin, model.dt, w, status=status, adjoint=adjoint, terminal=terminal,
         history=tuple(history),
-        objective=at.cost,
-    )
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,9 +295,4 @@ def _consistent(lin: Linearization) -> bool:
     size = 1.0 + float(np.max(np.abs(lin.x)))
     if np.max(np.abs(lin.g), initial=0.0) > TUNING.feasibility * size:
         return False
-    gap = np.zeros(lin.x.shape[1])
-    for A, defect in zip(lin.A, lin.defect, strict=True):
-        gap = A.dot(gap) + defect
-        if np.abs(gap).max() > TUNING.consistency * size:
-            return False
-    return True
+    return inconsistency(lin, np.inf) <= TUNING.consistency * size
