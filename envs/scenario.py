@@ -285,10 +285,7 @@ class Scenario:
 
     def with_parameters(self, parameters: dict[str, np.ndarray]) -> Scenario:
         """A scenario with these numbers, which may be symbols: not validated."""
-        copy = object.__new__(type(self))
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        vars(copy).update({**fields, **parameters})
-        return copy
+        return self._unchecked(parameters)
 
     def reposed(
         self, *, start: np.ndarray | None = None, final_time: float | None = None
@@ -297,13 +294,17 @@ class Scenario:
 
         Not validated: a car on its way may be inside an obstacle, which no scenario starts in.
         """
+        changes: dict[str, Any] = {}
+        if start is not None:
+            changes["start"] = start
+        if final_time is not None:
+            changes["horizon"] = float(final_time)
+        return self._unchecked(changes)
+
+    def _unchecked(self, changes: dict[str, Any]) -> Scenario:
         copy = object.__new__(type(self))
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        if start is not None:
-            fields["start"] = start
-        if final_time is not None:
-            fields["horizon"] = float(final_time)
-        vars(copy).update(fields)
+        vars(copy).update({**fields, **changes})
         return copy
 
     def initial_guess(self) -> tuple[np.ndarray, np.ndarray]:
