@@ -63,6 +63,12 @@ def goal_cost(x: Any, goal: Any, weight: Any) -> Any:
     return xp.sum(weight * error * error, axis=-1)
 
 
+def obstacle_distances(x: Any, obstacles: Any) -> Any:
+    """‖r − r_o‖ − δ_o to every obstacle [m], (..., 5) and (k, 3) -> (..., k)."""
+    xp = array_namespace(x)
+    return xp.sqrt(squared_distances(x, obstacles)) - obstacles[..., 2]
+
+
 def signed_distance(x: Any, obstacles: Any) -> Any:
     """Smallest ‖r − r_o‖ − δ_o over the obstacles [m], (..., 5) -> (...,).
 
@@ -71,4 +77,4 @@ def signed_distance(x: Any, obstacles: Any) -> Any:
     xp = array_namespace(x)
     if obstacles.shape[-2] == 0:
         return xp.full(x.shape[:-1], float("inf"), dtype=x.dtype)
-    return xp.min(xp.sqrt(squared_distances(x, obstacles)) - obstacles[..., 2], axis=-1)
+    return xp.min(obstacle_distances(x, obstacles), axis=-1)

@@ -265,6 +265,10 @@ class Scenario:
         """∂c_o/∂x, (..., k, 5)."""
         return cost.obstacle_constraints_jacobian(x, _like(x, self.obstacles))
 
+    def constraint(self, t: Any, x: Any) -> Any:
+        """δ_o − ‖r − r_o‖ for every obstacle, (..., k) [m]: a collision where positive."""
+        return -cost.obstacle_distances(x, _like(x, self.obstacles))
+
     def terminal(self, x: Any) -> Any:
         """g(x) = x − x^f, (..., 5)."""
         return x - _like(x, self.goal)
@@ -273,6 +277,11 @@ class Scenario:
         """∂g/∂x, (..., 5, 5): the identity."""
         shape = (*x.shape[:-1], car.STATE_DIM, car.STATE_DIM)
         return array_namespace(x).broadcast_to(_like(x, np.eye(car.STATE_DIM)), shape)
+
+    @property
+    def terminal_weight(self) -> np.ndarray:
+        """W of the goal cost gᵀ diag(W) g, (5,)."""
+        return self.goal_weight
 
     def parameters(self) -> dict[str, np.ndarray]:
         """The numbers in the functions above, so that planners compile them once for all."""

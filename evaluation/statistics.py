@@ -4,23 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Coverage of every interval in this package.
-CONFIDENCE = 0.95
+from slipcar.planner.risk import CONFIDENCE, wilson_interval
 
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson score interval of a proportion, 95 %.
-
-    Unlike the normal interval it stays in [0, 1] and says something when nothing was observed.
-
-    Raises:
-        ValueError: unless 0 <= successes <= trials and trials >= 1 (from scipy).
-    """
-    from scipy import stats  # here and below: half a second that `--help` need not wait
-
-    test = stats.binomtest(successes, trials)
-    interval = test.proportion_ci(confidence_level=CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
+__all__ = ["CONFIDENCE", "paired_difference", "standard_error", "wilson_interval"]
 
 
 def standard_error(values: np.ndarray) -> float:
@@ -60,7 +46,7 @@ def paired_difference(
     mean = float(difference.mean())
     if len(difference) < 2:
         return mean, float("nan"), float("nan")
-    from scipy import stats
+    from scipy import stats  # here: half a second that `--help` need not wait
 
     interval = stats.bootstrap(
         (difference,),

@@ -92,7 +92,8 @@ def kind_of(model: Model) -> tuple[Any, ...] | None:
     shapes = tuple((name, value.shape) for name, value in parameters.items())
     # Bound and free functions alike are found again on the traced copy: the class decides.
     posed = getattr(model.problem, "_problem", model.problem)  # of a `Reposed` one
-    return (type(posed), model.integrator, model.state_dim, model.control_dim, shapes)
+    kind = getattr(posed, "_kind", type(posed))  # of a guarded problem
+    return (kind, model.integrator, model.state_dim, model.control_dim, shapes)
 
 
 def trace(model: Model, *, native: bool) -> Kernels:

@@ -5,22 +5,19 @@ arrays; the same machine code serves every problem. The steps are those of `loop
 errors.
 
 Only the entry, `solve_many`, is compiled and cached on disk, with all it calls inside: numba's
-cache notices changes of the file it is in, no others. `_stamp` makes it notice those of its
+cache notices changes of the file it is in, no others. `caching.stamp` makes it notice those of its
 neighbours.
 """
 
 from __future__ import annotations
 
-import sys
-import threading
-import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 
+from slipcar.planner.newton.caching import stamp
 from slipcar.planner.newton.iterate_arrays import (
     covariance,
     evaluate,
@@ -42,7 +39,7 @@ from slipcar.planner.newton.sweep import sweep
 CONVERGED, MAX_ITERATIONS, STALLED, NO_STEP, NOT_FINITE = range(5)
 
 #: Modules the compiled code comes from.
-_SOURCES = ("compiled", "iterate_arrays", "model_arrays", "native", "riccati", "sweep")
+SOURCES = ("compiled", "iterate_arrays", "model_arrays", "native", "riccati", "sweep")
 #: Columns of the table that is written, one row for each step tried; the last two are processor
 #: cycles since the beginning.
 COLUMNS = (
@@ -267,18 +264,11 @@ def _iterate(
         last = step
     x_out[:], u_out[:], adjoint_out[:], nu_out[:] = at[14], at[15], last_adjoint, last_nu
     A_out[:], B_out[:], cost_out[:] = at[1], at[2], at[19][:4]
-    covariance(at, dt, S_out)
+    covariance(at[1], at[3], dt, S_out)
     return status, tried
 
 
-def _stamp() -> int:
-    """A number that changes with any file the compiled code comes from."""
-    folder = Path(__file__).parent
-    text = b"".join((folder / f"{name}.py").read_bytes() for name in _SOURCES)
-    return zlib.crc32(text)
-
-
-def _compiled(stamp: int) -> Any:
+def _compiled(version: int) -> Any:
     # A variable of an enclosing function is part of the key of numba's cache.
     @numba.njit(cache=True, error_model="numpy", nogil=True)
     def solve_many(
@@ -286,7 +276,7 @@ def _compiled(stamp: int) -> Any:
         tuning, free_first, d, x_guess, u_guess, x_out, u_out, adjoint_out, nu_out, A_out, B_out,
         S_out, cost_out, table, xs, us, nus, ended,
     ):  # fmt: skip
-        if stamp == -1:
+        if version == -1:
             return
         for i in range(len(x_guess)):
             ended[i, 0], ended[i, 1] = _iterate(
@@ -303,35 +293,4 @@ def _compiled(stamp: int) -> Any:
 #: trajectories (P, N, n) and (P, K, m), multipliers (P, K, n) and (P, q), A, B, Σ, the four costs
 #: (effort, penalty, running, w ∫ tr Σ dt), the table (P, max_iterations, columns), the
 #: trajectories of each step tried (P, steps to keep, ...), and (how it ended, steps tried).
-solve_many = _compiled(_stamp())
-
-
-_lock = threading.Lock()
-
-
-def prepare(call: Callable[[], None]) -> None:
-    """Compile `solve_many`, or load it from numba's cache on disk, by a call that does nothing.
-
-    Told on stderr where it takes long, which it does once after installation. LLVM's vectoriser
-    would double that time and gains nothing on loops as short as these.
-    """
-    with _lock:
-        if solve_many.signatures:
-            return
-        if not _on_disk():
-            say = "slipcar: compiling the planner (once; kept on disk by numba) ..."
-            print(say, file=sys.stderr, flush=True)
-        config: Any = numba.config
-        before, config.LOOP_VECTORIZE = config.LOOP_VECTORIZE, 0
-        try:
-            call()
-        finally:
-            config.LOOP_VECTORIZE = before
-
-
-def _on_disk() -> bool:
-    """Whether numba's cache has an index for `solve_many`; True where that cannot be told."""
-    try:
-        return Path(solve_many._cache._cache_file._index_path).exists()
-    except AttributeError:  # not a documented place
-        return True
+solve_many = _compiled(stamp(Path(__file__).with_name(f"{name}.py") for name in SOURCES))

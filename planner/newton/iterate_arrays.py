@@ -102,30 +102,42 @@ def evaluate(addresses, parameters, times, dt, R, weight, w, at):
 def variance(w, A, sigma, d_sigma, dt, Lambda, gradient, hessian):
     """`moments.variance_penalty`, with Λ by its backward sweep."""
     K, n = gradient.shape
-    d = sigma.shape[2]
-    value = 0.0
     LA = np.empty((n, n))
-    weighted = np.empty((n, d))
     for k in range(K - 1, -1, -1):
-        if k == K - 1:
-            Lambda[k] = 0.0
-        else:
-            LA[:] = 0.0
-            for i in range(n):
-                for v in range(n):
-                    a = Lambda[k + 1, i, v]
-                    if a != 0.0:
-                        for j in range(n):
-                            LA[i, j] += a * A[k + 1, v, j]
-            Lambda[k] = 0.0
-            for v in range(n):
-                for i in range(n):
-                    a = A[k + 1, v, i]
-                    if a != 0.0:
-                        for j in range(n):
-                            Lambda[k, i, j] += a * LA[v, j]
+        Lambda[k] = 0.0
+        if k < K - 1:
+            congruence(A[k + 1], Lambda[k + 1], LA, Lambda[k])
         for i in range(n):
             Lambda[k, i, i] += dt[k]
+    return noise_cost(w, Lambda, sigma, d_sigma, dt, gradient, hessian)
+
+
+@numba.njit(error_model="numpy")
+def congruence(A, P, PA, out):
+    """Add AᵀPA to `out`; `PA` is scratch."""
+    n = len(A)
+    PA[:] = 0.0
+    for i in range(n):
+        for v in range(n):
+            a = P[i, v]
+            if a != 0.0:
+                for j in range(n):
+                    PA[i, j] += a * A[v, j]
+    for v in range(n):
+        for i in range(n):
+            a = A[v, i]
+            if a != 0.0:
+                for j in range(n):
+                    out[i, j] += a * PA[v, j]
+
+
+@numba.njit(error_model="numpy")
+def noise_cost(w, P, sigma, d_sigma, dt, gradient, hessian):
+    """w Σ dt tr(P σσᵀ), and its gradient and Hessian by the states, σ linearised."""
+    K, n, d = sigma.shape
+    value = 0.0
+    weighted = np.empty((n, d))
+    for k in range(K):
         scale = w * dt[k]
         gradient[k] = 0.0
         hessian[k] = 0.0
@@ -133,7 +145,7 @@ def variance(w, A, sigma, d_sigma, dt, Lambda, gradient, hessian):
             for i in range(n):
                 total = 0.0
                 for v in range(n):
-                    total += Lambda[k, i, v] * sigma[k, v, a]
+                    total += P[k, i, v] * sigma[k, v, a]
                 weighted[i, a] = scale * total
                 value += weighted[i, a] * sigma[k, i, a]
             for i in range(n):
@@ -142,7 +154,7 @@ def variance(w, A, sigma, d_sigma, dt, Lambda, gradient, hessian):
                     if slope != 0.0:
                         gradient[k, y] += 2.0 * weighted[i, a] * slope
                         for v in range(n):
-                            share = 2.0 * scale * Lambda[k, i, v] * slope
+                            share = 2.0 * scale * P[k, i, v] * slope
                             if share != 0.0:
                                 for z in range(n):
                                     hessian[k, y, z] += share * d_sigma[k, v, a, z]
@@ -211,11 +223,9 @@ def inconsistency(at):
 
 
 @numba.njit(error_model="numpy")
-def covariance(at, dt, Sigma):
+def covariance(A, sigma, dt, Sigma):
     """`moments.covariance`."""
-    A, sigma = at[1], at[3]
-    K, n = at[0].shape
-    d = sigma.shape[2]
+    K, n, d = sigma.shape
     AS = np.empty((n, n))
     Sigma[0] = 0.0
     for k in range(K):

@@ -29,6 +29,7 @@ class Iterate:
         lin: values and first derivatives.
         d_ell: ∂ℓ/∂x at nodes 0..K−1, (K, m, n).
         H_xx: Hessian of H at nodes 1..K, (K, n, n).
+        d_sigma: ∂σ/∂x at nodes 0..K−1, (K, n, d, n).
         variance: w ∫ tr Σ dt as a quadratic, or None for w = 0.
         weights: w dt Λ, what σσᵀ of each node is weighed by in it, (K, n, n), or None.
     """
@@ -36,6 +37,7 @@ class Iterate:
     lin: Linearization
     d_ell: Array
     H_xx: Array
+    d_sigma: Array
     variance: moments.Variance | None
     weights: Array | None
 
@@ -101,12 +103,12 @@ def evaluate(model: Model, functions: Functions, w: float, x: Array, u: Array) -
         r_running=column * ell,
     )
     variance, weights = None, None
+    d_sigma = stage["d_sigma"].reshape(*sigma.shape, n)
     if w > 0.0:
-        d_sigma = stage["d_sigma"].reshape(*sigma.shape, n)
         Lambda = moments.adjoint_weights(A, dt)
         variance = moments.variance_penalty(w, sigma, d_sigma, Lambda, dt)
         weights = w * dt[:, None, None] * Lambda
-    return Iterate(lin, d_ell, H_xx, variance, weights)
+    return Iterate(lin, d_ell, H_xx, d_sigma, variance, weights)
 
 
 def quadratic_model(

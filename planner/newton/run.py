@@ -17,6 +17,7 @@ from slipcar.planner.convexify import linearize
 from slipcar.planner.feasibility import not_finite
 from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.newton import compiled
+from slipcar.planner.newton.caching import prepare
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.settings import TUNING
 from slipcar.planner.options import Options
@@ -250,7 +251,7 @@ def run(
 
     global _prepared
     if not _prepared:
-        compiled.prepare(lambda: part(slice(0, 0)))
+        prepare(compiled.solve_many, lambda: part(slice(0, 0)))
         _prepared = True
     began = time.perf_counter()
     workers = min(workers or os.cpu_count() or 1, P)

@@ -1,0 +1,408 @@
+"""Losses, belief and the LQ problem of :mod:`.loop` in arrays, for its compiled form.
+
+The same quantities as in :mod:`.losses`, :mod:`.belief` and :mod:`.loop`, filled in place. No
+function here is cached by itself: see :mod:`.compiled`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from slipcar.planner.expected.losses import DENSITY, EDGE, EDGE_DENSITY, EDGE_VALUE, FLOOR
+from slipcar.planner.newton.iterate_arrays import (
+    add_curvature,
+    congruence,
+    covariance,
+    noise_cost,
+    semidefinite,
+)
+
+_ROOT_HALF = math.sqrt(0.5)
+
+
+@numba.njit(error_model="numpy")
+def row_loss(c, s, tail):
+    """Value, slope, curvature and derivative by variance of one row of weight one: `losses.loss`."""
+    t = c / s
+    if tail:
+        if t <= EDGE:
+            density = DENSITY * math.exp(-0.5 * t * t)
+            value, slope, curvature = 0.5 * math.erfc(-t * _ROOT_HALF), density, -t * density
+        else:
+            over = t - EDGE
+            value = EDGE_VALUE + EDGE_DENSITY * over * (1.0 + 0.5 * over)
+            slope, curvature = EDGE_DENSITY * (1.0 + over), EDGE_DENSITY
+        by_variance = max(-0.5 * t * slope, 0.0) / (s * s)
+        return value, slope / s, curvature / (s * s), by_variance
+    if t < -38.0:  # nothing is left of the tail
+        return 0.0, 0.0, 0.0, 0.0
+    density, below = DENSITY * math.exp(-0.5 * t * t), 0.5 * math.erfc(-t * _ROOT_HALF)
+    value = (c * c + s * s) * below + c * s * density
+    return value, 2.0 * (c * below + s * density), 2.0 * below, below
+
+
+@numba.njit(error_model="numpy")
+def row_weight(weight, tail, dt, o, k):
+    """Of row o at node k + 1: penalties are charged per second."""
+    return weight[o] if tail[o] else weight[o] * dt[k]
+
+
+@numba.njit(error_model="numpy")
+def fill_losses(dt, weight, tail, c, s, slope, curvature):
+    """Slopes and curvatures of all rows."""
+    for k in range(c.shape[0]):
+        for o in range(c.shape[1]):
+            slope[k, o] = curvature[k, o] = 0.0
+            w = row_weight(weight, tail, dt, o, k)
+            if w > 0.0:
+                _, first, second, _ = row_loss(c[k, o], s[k, o], tail[o])
+                slope[k, o], curvature[k, o] = w * first, w * second
+
+
+@numba.njit(error_model="numpy")
+def deviations(C, Sigma, s):
+    """`losses.deviations`; Σ at nodes 0..K."""
+    K, p, n = C.shape
+    for o in range(p):
+        largest = 0.0
+        for k in range(K):
+            value = 0.0
+            for i in range(n):
+                a = C[k, o, i]
+                if a != 0.0:
+                    for j in range(n):
+                        value += a * Sigma[k + 1, i, j] * C[k, o, j]
+            s[k, o] = math.sqrt(max(value, 0.0))
+            largest = max(largest, s[k, o])
+        for k in range(K):
+            s[k, o] = max(s[k, o], FLOOR * largest + 1e-9)
+
+
+@numba.njit(error_model="numpy")
+def close_loop(A, B, gains, closed):
+    """A + BK."""
+    K, n, m = B.shape
+    for k in range(K):
+        for i in range(n):
+            for j in range(n):
+                value = A[k, i, j]
+                for v in range(m):
+                    value += B[k, i, v] * gains[k, v, j]
+                closed[k, i, j] = value
+
+
+@numba.njit(error_model="numpy")
+def optimal_gain(A, B, P, R, dt, gain):
+    """−(dt R + BᵀPB)⁻¹ BᵀPA, by Cholesky's factor."""
+    n, m = B.shape
+    L, BP = np.empty((m, m)), np.zeros((m, n))
+    for i in range(m):
+        for v in range(n):
+            b = B[v, i]
+            if b != 0.0:
+                for j in range(n):
+                    BP[i, j] += b * P[v, j]
+    for i in range(m):
+        for j in range(i + 1):
+            value = dt * R[i, j]
+            for v in range(n):
+                value += BP[i, v] * B[v, j]
+            for v in range(j):
+                value -= L[i, v] * L[j, v]
+            L[i, j] = math.sqrt(value) if i == j else value / L[j, j]
+    for j in range(n):
+        for i in range(m):
+            value = 0.0
+            for v in range(n):
+                value -= BP[i, v] * A[v, j]
+            for v in range(i):
+                value -= L[i, v] * gain[v, j]
+            gain[i, j] = value / L[i, i]
+        for i in range(m - 1, -1, -1):
+            value = gain[i, j]
+            for v in range(i + 1, m):
+                value -= L[v, i] * gain[v, j]
+            gain[i, j] = value / L[i, i]
+
+
+@numba.njit(error_model="numpy")
+def propagate(
+    at, dt, R, weight, tail, W, feedback, w, saturation, damping, fresh, lower, upper,
+    gains, held, closed, Sigma, s, P, vg, vh, low_bound, high_bound,
+):  # fmt: skip
+    """`belief.propagate`; writes from `gains` on. `fresh`: there are no weights to start from."""
+    A, B, sigma, d_sigma, C, c, Hxx, G = at[1], at[2], at[3], at[4], at[8], at[7], at[11], at[13]
+    K, n, m = B.shape
+    p = C.shape[1]
+    close_loop(A, B, gains, closed)
+    covariance(closed, sigma, dt, Sigma)
+    deviations(C, Sigma, s)
+    largest = 0.0
+    wanted = np.zeros((K, p))
+    for k in range(K):
+        for o in range(p):
+            scale = row_weight(weight, tail, dt, o, k)
+            if scale > 0.0:
+                wanted[k, o] = scale * row_loss(c[k, o], s[k, o], tail[o])[3]
+                largest = max(largest, wanted[k, o])
+    least = 1e-9 * largest + 1e-30
+    for k in range(K):
+        for o in range(p):
+            if fresh or damping == 1.0 or not tail[o]:
+                held[k, o] = wanted[k, o]
+            else:
+                before, now = max(held[k, o], least), max(wanted[k, o], least)
+                held[k, o] = before ** (1.0 - damping) * now**damping
+    D, PA = np.empty((n, n)), np.empty((n, n))
+    for k in range(K, -1, -1):
+        # P at node k + 1 is in P[k]; here node k's is made, or, at first, the last node's.
+        if k < K:
+            if feedback:
+                optimal_gain(A[k], B[k], P[k], R, dt[k], gains[k])
+                for i in range(n):
+                    for j in range(n):
+                        value = A[k, i, j]
+                        for v in range(m):
+                            value += B[k, i, v] * gains[k, v, j]
+                        closed[k, i, j] = value
+            if k == 0:
+                break
+        D[:] = 0.0
+        bent = False
+        for i in range(n):
+            for j in range(n):
+                D[i, j] = Hxx[k - 1, i, j]
+                bent = bent or D[i, j] != 0.0
+        if bent:
+            semidefinite(D)
+            for i in range(n):
+                for j in range(n):
+                    D[i, j] *= 0.5 * dt[k - 1]
+        for i in range(n):
+            D[i, i] += w * dt[k - 1]
+        for o in range(p):
+            a = held[k - 1, o]
+            if a > 0.0:
+                for i in range(n):
+                    b = a * C[k - 1, o, i]
+                    if b != 0.0:
+                        for j in range(n):
+                            D[i, j] += b * C[k - 1, o, j]
+        if k == K:
+            for v in range(len(W)):
+                for i in range(n):
+                    b = W[v] * G[v, i]
+                    if b != 0.0:
+                        for j in range(n):
+                            D[i, j] += b * G[v, j]
+        else:
+            congruence(closed[k], P[k], PA, D)
+            if feedback:
+                for a in range(m):
+                    for b in range(m):
+                        r = dt[k] * R[a, b]
+                        if r != 0.0:
+                            for i in range(n):
+                                for j in range(n):
+                                    D[i, j] += gains[k, a, i] * r * gains[k, b, j]
+        for i in range(n):
+            for j in range(n):
+                P[k - 1, i, j] = 0.5 * (D[i, j] + D[j, i])
+    if feedback:
+        covariance(closed, sigma, dt, Sigma)
+        deviations(C, Sigma, s)
+    noise_cost(1.0, P, sigma, d_sigma, dt, vg, vh)
+    for k in range(K):
+        for i in range(m):
+            spread = 0.0
+            if feedback:
+                for a in range(n):
+                    for b in range(n):
+                        spread += gains[k, i, a] * Sigma[k, a, b] * gains[k, i, b]
+            margin = min(saturation * math.sqrt(max(spread, 0.0)), 0.45 * (upper[i] - lower[i]))
+            low_bound[k, i], high_bound[k, i] = lower[i] + margin, upper[i] - margin
+
+
+@numba.njit(error_model="numpy")
+def cost(at, dt, weight, tail, W, soft, s, P):
+    """Expected cost, P and s held: `loop._cost`."""
+    sigma, c, g, values = at[3], at[7], at[12], at[19]
+    K, n, d = sigma.shape
+    total = values[0] + values[2]
+    for k in range(K):
+        for o in range(c.shape[1]):
+            scale = row_weight(weight, tail, dt, o, k)
+            if scale > 0.0:
+                total += scale * row_loss(c[k, o], s[k, o], tail[o])[0]
+        for a in range(d):
+            for i in range(n):
+                b = sigma[k, i, a]
+                if b != 0.0:
+                    for j in range(n):
+                        total += dt[k] * b * P[k, i, j] * sigma[k, j, a]
+    if soft:
+        for v in range(len(g)):
+            total += W[v] * g[v] * g[v]
+    return total
+
+
+@numba.njit(error_model="numpy")
+def priced(at, adjoint, nu, soft):
+    """Σ λᵀf + νᵀg, and the 1-norms of f and g."""
+    defect, g = at[16], at[12]
+    value, gap, miss = 0.0, 0.0, 0.0
+    for k in range(defect.shape[0]):
+        for i in range(defect.shape[1]):
+            value += adjoint[k, i] * defect[k, i]
+            gap += abs(defect[k, i])
+    if not soft:
+        for j in range(len(g)):
+            value += nu[j] * g[j]
+            miss += abs(g[j])
+    return value, gap, miss
+
+
+@numba.njit(error_model="numpy")
+def quadratic(
+    addresses, parameters, times, dt, R, at, slope, curvature, W, soft, adjoint, nu, vg, vh,
+    Q, q, Rk, r, S,
+):  # fmt: skip
+    """`loop._quadratic`."""
+    ell, d_ell, C, Hx, Hxx = at[5], at[6], at[8], at[10], at[11]
+    g, G, x, u = at[12], at[13], at[14], at[15]
+    K, n = q.shape
+    m, p = r.shape[1], C.shape[1]
+    for k in range(K):
+        for i in range(n):
+            q[k, i] = dt[k] * Hx[k, i]
+            for j in range(n):
+                Q[k, i, j] = dt[k] * Hxx[k, i, j]
+        for o in range(p):
+            if slope[k, o] != 0.0 or curvature[k, o] != 0.0:
+                for i in range(n):
+                    a = C[k, o, i]
+                    if a != 0.0:
+                        q[k, i] += a * slope[k, o]
+                        for j in range(n):
+                            Q[k, i, j] += a * curvature[k, o] * C[k, o, j]
+        for i in range(m):
+            r[k, i] = dt[k] * ell[k, i]
+            for j in range(m):
+                Rk[k, i, j] = 2.0 * dt[k] * R[i, j]
+                r[k, i] += 2.0 * dt[k] * R[i, j] * u[k, j]
+    S[:] = 0.0
+    add_curvature(addresses, parameters, times, dt, x, u, adjoint, nu, slope, Q, Rk, S)
+    for k in range(K - 1):
+        for i in range(n):
+            for j in range(m):
+                q[k, i] += dt[k + 1] * d_ell[k + 1, j, i] * u[k + 1, j]
+            q[k, i] += vg[k + 1, i]
+            for j in range(n):
+                Q[k, i, j] += vh[k + 1, i, j]
+    if soft:
+        for v in range(len(W)):
+            for i in range(n):
+                a = 2.0 * W[v] * G[v, i]
+                if a != 0.0:
+                    q[K - 1, i] += a * g[v]
+                    for j in range(n):
+                        Q[K - 1, i, j] += a * G[v, j]
+
+
+@numba.njit(error_model="numpy")
+def load(
+    dt, at, Q, q, Rk, r, shift, kappa, low, high, low_bound, high_bound, stiffness, Qs, qs, Rs, rs
+):  # fmt: skip
+    """The LQ problem: the model, shift, held bounds, terminal curvature."""
+    g, G, u = at[12], at[13], at[15]
+    K, n = q.shape
+    m = r.shape[1]
+    for k in range(K):
+        for i in range(n):
+            qs[k, i] = q[k, i]
+            for j in range(n):
+                Qs[k, i, j] = Q[k, i, j]
+            Qs[k, i, i] += 2.0 * dt[k] * shift
+        for i in range(m):
+            rs[k, i] = r[k, i]
+            for j in range(m):
+                Rs[k, i, j] = Rk[k, i, j]
+            Rs[k, i, i] += 2.0 * dt[k] * shift
+            if high[k, i]:
+                Rs[k, i, i] += stiffness
+                rs[k, i] -= stiffness * (high_bound[k, i] - u[k, i])
+            elif low[k, i]:
+                Rs[k, i, i] += stiffness
+                rs[k, i] -= stiffness * (low_bound[k, i] - u[k, i])
+    if kappa > 0.0:
+        for j in range(len(g)):
+            for i in range(n):
+                a = kappa * G[j, i]
+                if a != 0.0:
+                    qs[K - 1, i] += a * g[j]
+                    for v in range(n):
+                        Qs[K - 1, i, v] += a * G[j, v]
+
+
+@numba.njit(error_model="numpy")
+def active_bounds(u, e, lower, upper, low, high, low_new, high_new):
+    """Bounds (K, m) that the step passes; whether they are those it was computed with."""
+    same = True
+    for k in range(u.shape[0]):
+        for i in range(u.shape[1]):
+            below, above = u[k, i] + e[k, i] < lower[k, i], u[k, i] + e[k, i] > upper[k, i]
+            same = same and below == low[k, i] and above == high[k, i]
+            low_new[k, i], high_new[k, i] = below, above
+    return same
+
+
+@numba.njit(error_model="numpy")
+def clip(u, e, lower, upper):
+    """Clip a step of the controls to bounds (K, m)."""
+    for k in range(u.shape[0]):
+        for i in range(u.shape[1]):
+            e[k, i] = min(max(u[k, i] + e[k, i], lower[k, i]), upper[k, i]) - u[k, i]
+
+
+@numba.njit(error_model="numpy")
+def respond(A, B, f, d, e):
+    """Let the states follow the controls."""
+    K, n = d.shape
+    for k in range(K):
+        for i in range(n):
+            value = f[k, i]
+            if k > 0:
+                for j in range(n):
+                    value += A[k, i, j] * d[k - 1, j]
+            for j in range(e.shape[1]):
+                value += B[k, i, j] * e[k, j]
+            d[k, i] = value
+
+
+@numba.njit(error_model="numpy")
+def model_change(dt, R, Q, q, Rk, r, S, d, e):
+    """Change of the cost by the model; ∫‖Δu‖² dt, ∫ΔuᵀRΔu dt and ∫‖Δx‖² dt."""
+    K, n = q.shape
+    m = r.shape[1]
+    change, step, length, radius = 0.0, 0.0, 0.0, 0.0
+    for k in range(K):
+        for i in range(m):
+            step += dt[k] * e[k, i] * e[k, i]
+            inner = r[k, i]
+            for j in range(m):
+                inner += 0.5 * Rk[k, i, j] * e[k, j]
+                length += dt[k] * e[k, i] * R[i, j] * e[k, j]
+            if k > 0:
+                for j in range(n):
+                    inner += S[k, i, j] * d[k - 1, j]
+            change += inner * e[k, i]
+        for i in range(n):
+            radius += dt[k] * d[k, i] * d[k, i]
+            inner = q[k, i]
+            for j in range(n):
+                inner += 0.5 * Q[k, i, j] * d[k, j]
+            change += inner * d[k, i]
+    return change, step, length, radius
