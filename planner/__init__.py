@@ -16,18 +16,21 @@ from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.plan import Plan
 from slipcar.planner.planning import plan
 from slipcar.planner.problem import Problem
-from slipcar.planner.records import Alternative, TimeStep
+from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
+from slipcar.planner.risk import Risk
 from slipcar.planner.status import Status
 
 __all__ = [
     "Alternative",
     "Certificate",
+    "ExpectedCost",
     "Feedback",
     "Iteration",
     "Multipliers",
     "OpenLoop",
     "Plan",
     "Problem",
+    "Risk",
     "Status",
     "TimeStep",
     "plan",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,54 @@ from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan
 from slipcar.planner.problem import Model, Problem
+from slipcar.planner.steering import Steering
 
 Array = np.ndarray
+
+
+def build_steered(
+    steered: Steering,
+    nominal: Outcome,
+    model: Model,
+    problem: Problem,
+    *,
+    guess: Array,
+    options: dict[str, Any],
+    seconds: float,
+    **more: Any,
+) -> Plan:
+    """A plan of an expected cost, which started from the plan of the mean `nominal`."""
+    found = steered.found
+    penalties = found.c[:, : len(model.weight)]
+    outcome = dataclasses.replace(
+        nominal,
+        status=steered.status,
+        x=found.x,
+        u=found.u,
+        A=found.A,
+        B=found.B,
+        covariance=found.covariance,
+        effort=found.effort,
+        penalty=float(np.vdot(model.dt[:, None] * model.weight, np.maximum(penalties, 0.0) ** 2)),
+        running=found.running,
+        adjoint=found.adjoint,
+        terminal=found.terminal,
+        trust_multiplier=0.0,
+        iterations=nominal.iterations + steered.iterations,
+        message=steered.message,
+    )
+    return build(
+        outcome,
+        model,
+        problem,
+        guess=guess,
+        options=options,
+        seconds=seconds,
+        gains=found.gains if options["feedback"] else None,
+        expected=steered.cost,
+        risk=steered.risk,
+        **more,
+    )
 
 
 def build(
@@ -23,6 +70,7 @@ def build(
     guess: Array,
     options: dict[str, Any],
     seconds: float,
+    gains: Array | None = None,
     **more: Any,
 ) -> Plan:
     """A plan: what `outcome` found for `model`, which completes `problem`, from states `guess`."""
@@ -44,7 +92,7 @@ def build(
         ),
         A=outcome.A,
         B=outcome.B,
-        gains=None,
+        gains=gains,
         solve_time=seconds,
         options=options,
         problem=problem,

@@ -15,7 +15,8 @@ from slipcar.planner import plan_file
 from slipcar.planner.history import Iteration
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem import Problem
-from slipcar.planner.records import Alternative, TimeStep
+from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
+from slipcar.planner.risk import Risk
 from slipcar.planner.status import Status
 
 if TYPE_CHECKING:
@@ -54,6 +55,10 @@ class Plan:
         alternatives: what became of each guess, the best first, when there were several starts.
         time_search: every horizon tried, when the final time was free.
         shot: the last attempt at shooting, when it was asked for and one was made; not saved.
+        expected: what the plan costs in expectation, when it was made for that: with `risk`,
+            `risk_price`, `feedback` or `expected`. The history is then that of the plan of the
+            mean it started from, and `covariance` is that of the closed loop.
+        risk: requested, predicted and verified probability of a violation, when one was asked for.
     """
 
     status: Status
@@ -79,6 +84,8 @@ class Plan:
     alternatives: tuple[Alternative, ...] = ()
     time_search: tuple[TimeStep, ...] = ()
     shot: Shot | None = None
+    expected: ExpectedCost | None = None
+    risk: Risk | None = None
 
     @property
     def cost(self) -> float:
@@ -95,8 +102,14 @@ class Plan:
         """What the plan proves: multipliers and residuals of the maximum principle (SPEC §3.7).
 
         Raises:
-            ValueError: if the plan does not know its problem (loaded from a file without it).
+            ValueError: if the plan does not know its problem (loaded from a file without it), or
+                minimises an expected cost: that is not the problem the conditions are of.
         """
+        if self.expected is not None:
+            raise ValueError(
+                "the certificate is of plans of the mean: leave risk, risk_price, feedback and "
+                "expected out"
+            )
         from slipcar.planner.certificate import certify
 
         # At its bound the horizon's slope need not vanish.

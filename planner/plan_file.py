@@ -15,7 +15,8 @@ import numpy as np
 from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem import Problem
-from slipcar.planner.records import Alternative, TimeStep
+from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
+from slipcar.planner.risk import Risk
 from slipcar.planner.status import Status
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-#: 2: running costs, alternatives, horizons tried.
-_FORMAT = 2
+#: 2: running costs, alternatives, horizons tried. 3: expected cost and risk.
+_FORMAT, _READ = 3, (2, 3)
 _ARRAYS = ("times", "mean", "controls", "covariance", "guess", "A", "B", "gains")
 _SCALARS = (
     "effort", "obstacle_cost", "running_cost", "variance", "iterations", "solve_time", "message",
@@ -52,6 +53,8 @@ def write(plan: Plan, path: str | os.PathLike[str]) -> Path:
             {**dataclasses.asdict(row), "status": row.status.name} for row in plan.alternatives
         ],
         "time_search": [dataclasses.asdict(row) for row in plan.time_search],
+        "expected": None if plan.expected is None else dataclasses.asdict(plan.expected),
+        "risk": None if plan.risk is None else plan.risk.as_dict(),
         **{name: getattr(plan, name) for name in _SCALARS},
     }
     arrays["header"] = np.array(json.dumps(header))
@@ -75,7 +78,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         version = header.get("format")
     except Exception as error:  # zipfile, NumPy and JSON each raise their own
         raise ValueError(f"{path} is not a plan or is damaged: {error}") from error
-    if version != _FORMAT:
+    if version not in _READ:
         raise ValueError(f"{path} has plan format {version!r}; this version reads {_FORMAT}")
     try:
         return {
@@ -89,6 +92,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
             "problem": _problem_from_data(header["problem"]),
             "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
             "time_search": tuple(TimeStep(**row) for row in header["time_search"]),
+            "expected": ExpectedCost(**header["expected"]) if header.get("expected") else None,
+            "risk": Risk.from_dict(header["risk"]) if header.get("risk") else None,
         }
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a plan or is damaged: {error!r}") from error

@@ -11,7 +11,7 @@ import numpy as np
 
 from slipcar.planner import checks
 from slipcar.planner.backends import Solver
-from slipcar.planner.build import build
+from slipcar.planner.build import build, build_steered
 from slipcar.planner.free_time import checked_bounds
 from slipcar.planner.free_time import free_final_time as search_time
 from slipcar.planner.history import Iteration
@@ -23,6 +23,8 @@ from slipcar.planner.problem import Problem, model_of
 from slipcar.planner.reposed import reposed
 from slipcar.planner.shot import solve_shooting
 from slipcar.planner.starts import multistart
+from slipcar.planner.status import Status
+from slipcar.planner.steering import Request, steer
 from slipcar.planner.warm_start import given_guess, run_guarded
 
 Array = np.ndarray
@@ -31,7 +33,7 @@ Array = np.ndarray
 def plan(
     problem: Problem,
     *,
-    variance_weight: float = 1.0,
+    variance_weight: float | None = None,
     solver: str | Solver = "structured",
     method: str = "auto",
     tolerance: float = 1e-3,
@@ -49,6 +51,12 @@ def plan(
     free_final_time: bool = False,
     time_weight: float = 1.0,
     final_time_bounds: tuple[float, float] | None = None,
+    risk: float | None = None,
+    risk_price: float | None = None,
+    risk_episodes: int = 100_000,
+    feedback: bool = False,
+    expected: bool = False,
+    terminal_weight: Any = None,
     check_derivatives: bool = False,
     callback: Callable[[Iteration], bool | None] | None = None,
 ) -> Plan:
@@ -58,7 +66,8 @@ def plan(
 
     Args:
         problem: anything that satisfies :class:`slipcar.planner.Problem`; a Scenario does.
-        variance_weight: w ≥ 0; 0 is deterministic SCP.
+        variance_weight: w ≥ 0; 0 is deterministic SCP. None is 1, or 0 with one of `risk`,
+            `risk_price`, `feedback` and `expected`, whose cost counts the noise already.
         solver: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with their interface; see
             :mod:`slipcar.planner.backends`.
         method: `"newton"`: one LQ problem per iteration and Newton's method at the end, quadratic
@@ -101,6 +110,21 @@ def plan(
         time_weight: cost of a second of final time, > 0.
         final_time_bounds: least and largest final time [s], counted from the first node; None is
             1/10 and 10 times the problem's.
+        risk: δ in (0, 1): the probability that a path violates `problem.constraint` at any node
+            must not exceed it. The constraint is priced (see `risk_price`) and the price searched
+            for by Monte Carlo on common random numbers; `Plan.risk` holds what was predicted and
+            what `risk_episodes` fresh paths say. Where no price leads there: status
+            RISK_UNREACHABLE, with the plan of least risk found.
+        risk_price: ν ≥ 0: add ν Σ P(violation) over nodes and constraints to the expected cost
+            (Boole's bound; optimal risk allocation). No Monte Carlo: milliseconds.
+        risk_episodes: fresh paths that verify a risk, ≥ 100.
+        feedback: plan u = ū + K (x − μ) with the gains that minimise the expected cost: effort
+            of the corrections included, bounds kept at two standard deviations of them.
+            `Feedback(plan)` plays it.
+        expected: charge the penalties' expectation, E Σ w max(0, c)² for Gaussian states, instead
+            of their value at the mean. With `risk`, `risk_price` and `feedback` it always is.
+        terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0. None:
+            exact, or with `feedback` the problem's `terminal_weight`, if it has one.
         check_derivatives: compare every Jacobian with differences before planning.
         callback: called with each :class:`Iteration`, from whichever guess and at whichever
             horizon; returning True stops that guess (all others begin nonetheless) and any search
@@ -117,6 +141,21 @@ def plan(
     began = time.perf_counter()
     if shooting and compiled:
         raise ValueError("shooting=True watches each iterate: leave compiled=True out")
+    request = Request(
+        risk=risk,
+        price=risk_price,
+        feedback=feedback,
+        expected=expected,
+        terminal_weight=terminal_weight,
+        episodes=risk_episodes,
+    )
+    if request.wanted and (shooting or free_final_time):
+        raise ValueError(
+            "risk, risk_price, feedback and expected cannot be combined with shooting or "
+            "free_final_time"
+        )
+    if variance_weight is None:
+        variance_weight = 0.0 if request.wanted else 1.0
     if shooting and method == "auto":
         method = "convex"
     options = Options(
@@ -141,6 +180,8 @@ def plan(
     model = model_of(problem)
     if integrator != model.integrator:
         model = dataclasses.replace(model, integrator=integrator)
+    if request.wanted:
+        request.check(options, model)
     if free_final_time:
         check_number("time_weight", time_weight)
         bounds = checked_bounds(model, final_time_bounds)
@@ -157,6 +198,14 @@ def plan(
         "free_final_time": bool(free_final_time),
         "time_weight": float(time_weight) if free_final_time else None,
         "final_time_bounds": list(bounds) if free_final_time else None,
+        "risk": risk,
+        "risk_price": risk_price,
+        "risk_episodes": int(risk_episodes),
+        "feedback": bool(feedback),
+        "expected": bool(expected),
+        "terminal_weight": None
+        if terminal_weight is None
+        else np.asarray(terminal_weight, dtype=float).tolist(),
     }
     more: dict[str, Any] = {}
     convex = method == "convex" or bool(options.only_convex)
@@ -184,6 +233,18 @@ def plan(
             model, options, found, time_weight=float(time_weight), bounds=bounds
         )
         problem = reposed(problem, times=model.times)
+    if request.wanted and found.status not in (Status.STOPPED, Status.SOLVER_FAILED):
+        steered = steer(problem, options, request, found.x, found.u)
+        return build_steered(
+            steered,
+            found,
+            model,
+            problem,
+            guess=x,
+            options=record,
+            seconds=time.perf_counter() - began,
+            **more,
+        )
     return build(
         found,
         model,

@@ -22,8 +22,8 @@ from slipcar.planner.options import check_count, check_number
 
 #: −d log P / d log ν: assumed where only one rate is known, and the range believed of a secant.
 _SLOPE, _FLATTEST, _STEEPEST = 0.7, 0.3, 4.0
-#: Largest step in price away from what is known, upwards; downwards 10, then 100, ...
-_STRIDE = 100.0
+#: Largest step in price away from what is known, and downwards, where rates near zero say little.
+_FARTHEST, _DOWN = 100.0, 10.0
 #: A bracket this narrow (ratio of prices) is not worth another plan.
 _NARROW = 1.05
 #: Prices below this share of the first are as good as none.
@@ -142,9 +142,7 @@ class _Search:
         self.low: Trial | None = None
         self.high: Trial | None = None
         self.failed: float | None = None
-        self._weight = {"low": 1.0, "high": 1.0}
-        self._last = ""
-        self._down = 10.0
+        self._width = math.inf  # of the bracket, when a secant was last drawn in it
 
     def nearest(self, price: float) -> Any | None:
         """The answer at the nearest price, on the logarithmic scale."""
@@ -159,13 +157,10 @@ class _Search:
         if trial.rate is None:
             self.failed = trial.price
             return
-        side = "low" if trial.rate > self.target else "high"
-        # Illinois: an end that stays twice running counts half as much, lest the other creep.
-        other = "high" if side == "low" else "low"
-        self._weight[side] = 1.0
-        self._weight[other] = 0.5 * self._weight[other] if side == self._last else 1.0
-        self._last = side
-        setattr(self, side, trial)
+        if trial.rate > self.target:
+            self.low = trial
+        else:
+            self.high = trial
 
     def next_price(self) -> float | None:
         """Where to look next; None when there is nothing left to gain."""
@@ -190,37 +185,38 @@ class _Search:
         assert trial.rate is not None
         return math.log(max(trial.rate, self.zero) / self.aim)
 
-    def _stride(self, trial: Trial) -> float:
-        """Ratio of prices from the trial to where the rate should be the aim.
+    def _stride(self, trial: Trial, largest: float) -> float:
+        """Ratio of prices from the trial, the last one, to where the rate should be the aim.
 
-        By the secant through the last two answers, within the slopes that are believed.
+        By the secant through the last two answers, within the slopes that are believed; on a
+        plateau, where a secant says nothing, ever faster.
         """
-        slope = _SLOPE
+        slope, least = _SLOPE, 1.1
         solved = [t for t in self.trials if t.rate is not None and t is not trial]
         if solved:
             before = solved[-1]
-            fall = self._excess(before) - self._excess(trial)
-            slope = fall / math.log(trial.price / before.price)
+            moved = math.log(trial.price / before.price)
+            slope = (self._excess(before) - self._excess(trial)) / moved
+            if slope < _FLATTEST:
+                least = min(max(3.0, math.exp(2.0 * abs(moved))), _FARTHEST)
             slope = min(max(slope, _FLATTEST), _STEEPEST)
-        return math.exp(min(abs(self._excess(trial)) / slope, math.log(_STRIDE)))
+        wanted = math.exp(min(abs(self._excess(trial)) / slope, math.log(largest)))
+        return max(wanted, least)
 
     def _dearer(self) -> float | None:
         """All answers are too risky: on to a higher price, short of those that fail."""
         assert self.low is not None
-        price = min(self.low.price * max(self._stride(self.low), 1.1), self.largest)
+        price = min(self.low.price * self._stride(self.low, _FARTHEST), self.largest)
         if self.failed is not None and self.failed > self.low.price:
             price = min(price, math.sqrt(self.low.price * self.failed))
         return price if price > _NARROW * self.low.price else None
 
     def _cheaper(self) -> float | None:
-        """All answers are safer than asked: on to a lower price, ever faster on a plateau."""
+        """All answers are safer than asked: on to a lower price."""
         assert self.high is not None
         if self.high.price <= self.smallest:
             return None
-        stride = min(max(self._stride(self.high), 1.1), self._down)
-        if stride == self._down:
-            self._down *= 10.0
-        return max(self.high.price / stride, self.smallest)
+        return max(self.high.price / self._stride(self.high, _DOWN), self.smallest)
 
     def _cheaper_than_failure(self) -> float | None:
         """No answer at all yet."""
@@ -228,7 +224,7 @@ class _Search:
         return max(self.failed / 10.0, self.smallest) if self.failed > self.smallest else None
 
     def _between(self) -> float | None:
-        """False position between the ends; bisection around a price that failed."""
+        """On the secant between the ends; halfway if it misleads, or around a failure."""
         assert self.low is not None
         assert self.high is not None
         a, b = math.log(self.low.price), math.log(self.high.price)
@@ -237,8 +233,10 @@ class _Search:
         if self.failed is not None and self.low.price < self.failed < self.high.price:
             c = math.log(self.failed)
             return math.exp(0.5 * (a + c) if c - a > b - c else 0.5 * (c + b))
-        up = self._weight["low"] * self._excess(self.low)
-        down = self._weight["high"] * self._excess(self.high)
-        # Away from the ends, where the secant learns nothing.
+        last, self._width = self._width, b - a
+        if self._width > 0.5 * last:  # a secant that does not halve the bracket misleads
+            return math.exp(0.5 * (a + b))
+        up, down = self._excess(self.low), self._excess(self.high)
+        # Not next to the ends, where it would learn nothing.
         fraction = min(max(up / (up - down), 0.05), 0.95)
         return math.exp(a + fraction * (b - a))

@@ -48,3 +48,30 @@ class TimeStep:
     radius: float
     accepted: bool
     iterations: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ExpectedCost:
+    """What a plan costs in expectation, to second order in the noise (Gaussian states).
+
+    Attributes:
+        effort: Σ dt ūᵀRū.
+        feedback: Σ dt tr(K Σ Kᵀ R), the effort of the corrections.
+        running: E Σ dt (H + ℓᵀu).
+        penalty: E Σ dt Σ w max(0, c)².
+        goal: E gᵀWg; 0 where the terminal condition is exact and its spread not charged.
+        risk: Σ Φ(h/s) over nodes and constraints, at most 1: Boole's bound of the probability of
+            any violation.
+    """
+
+    effort: float
+    feedback: float
+    running: float
+    penalty: float
+    goal: float
+    risk: float
+
+    @property
+    def total(self) -> float:
+        """All but the risk."""
+        return self.effort + self.feedback + self.running + self.penalty + self.goal

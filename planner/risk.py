@@ -101,8 +101,8 @@ class Risk:
 
 def check_risk(delta: Any) -> None:
     """Raise ValueError unless δ is a number in (0, 1)."""
-    number = isinstance(delta, numbers.Real) and not isinstance(delta, bool)
-    if not (number and 0.0 < delta < 1.0):
+    # Booleans are numbers to Python, but 0 or 1, which are no risks; NaN is in no interval.
+    if not (isinstance(delta, numbers.Real) and 0.0 < delta < 1.0):
         raise ValueError(f"risk must be a probability in (0, 1), e.g. 0.01 for 1 %, not {delta!r}")
 
 

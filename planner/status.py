@@ -13,6 +13,7 @@ class Status(enum.Enum):
     INFEASIBLE = "settled, but the terminal condition cannot be met (virtual control remains)"
     STALLED = "stopped: no step within the trust region lowers the merit function"
     SOLVER_FAILED = "stopped: the sub-problem solver did not find a solution"
+    RISK_UNREACHABLE = "settled, but no price of risk led to the risk asked for (the least is kept)"
     STOPPED = "stopped by the callback"
 
     def __str__(self) -> str:

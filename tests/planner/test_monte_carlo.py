@@ -10,6 +10,7 @@ from scipy.stats import binom, multivariate_normal, norm
 
 from slipcar.evaluation import evaluate
 from slipcar.evaluation import statistics as evaluation_statistics
+from slipcar.evaluation.noise import block_noise
 from slipcar.planner import Feedback, OpenLoop, plan
 from slipcar.planner.monte_carlo import violations
 from slipcar.planner.risk import PricedRate, Risk, check_risk, wilson_interval
@@ -136,7 +137,7 @@ def test_a_path_depends_on_the_seed_and_its_index_alone():
     other = violations(problem, still, episodes=9_000, seed=8)
     assert 0.2 < np.mean(long != other) < 0.6  # two independent draws of p = 0.24 and more
     parts = long[:8_192].reshape(4, -1)
-    assert not any((parts[0] == part).all() for part in parts[1:])  # blocks differ as well
+    assert not any((parts[0] == part).all() for part in parts[1:])  # nor do blocks repeat
 
 
 def test_two_controllers_meet_the_same_noise():
@@ -148,7 +149,8 @@ def test_two_controllers_meet_the_same_noise():
 
 def test_paths_that_are_lost_count_as_violations():
     # Beyond 1 the state runs off to infinity, where no bound is ever seen to be broken.
-    problem = linear(times=(0.0, 1.0, 2.0), bound=0.0)
+    problem = linear(times=(0.0, 1.0, 2.0, 3.0))
+    problem.diffusion = lambda t, x: np.where(t < 0.5, 1.0, 0.0)[..., None, None]
     problem.drift = lambda t, x, u: u + np.where(x > 1.0, np.inf, 0.0)
     problem.constraint = lambda t, x: np.full((*x.shape[:-1], 1), -1.0)
     finite = []
@@ -182,9 +184,22 @@ def test_the_car_collides_as_often_as_in_the_evaluation(paper, controller):
     theirs = evaluate(driver, paper, episodes=n, seed=0)
     p = 0.5 * (ours + theirs.collision_rate)
     assert abs(ours - theirs.collision_rate) < 4.5 * np.sqrt(2.0 * p * (1.0 - p) / n)
-    # Independent paths, although the seeds are equal: else one would not verify the other.
-    mine = violations(paper, driver.control, episodes=n, seed=0)
-    assert abs(np.corrcoef(mine, theirs.metrics.collision)[0, 1]) < 4.5 / np.sqrt(n)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_evaluations_with_the_same_seed_meet_other_noise(seed):
+    # Or a plan would be judged by the paths its price was chosen on.
+    problem = linear(bound=0.0)
+    problem.start = np.zeros(3)
+    problem.drift = lambda t, x, u: 0.0 * x
+    problem.diffusion = lambda t, x: np.broadcast_to(np.eye(3), (*x.shape, 3))
+    for block in (0, 1):
+        theirs = next(block_noise(seed, block, 1))[:, 0] > 0.0
+        for i in range(3):
+            problem.constraint = lambda t, x, i=i: x[..., i : i + 1]
+            ours = violations(problem, still, episodes=4_096, seed=seed).reshape(4, -1)
+            for part in ours:
+                assert abs(np.mean(part == theirs[:, i]) - 0.5) < 4.5 * 0.5 / np.sqrt(1_024)
 
 
 def test_bad_input_is_named(paper):

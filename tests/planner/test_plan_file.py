@@ -180,7 +180,7 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(format=99), "format 99; this version reads 2"),
+        (lambda h, a: h.update(format=99), "format 99; this version reads 3"),
         (lambda h, a: h.pop("format"), "format None"),
         (lambda h, a: h.pop("effort"), "damaged.*effort"),
         (lambda h, a: h.update(status="FINE"), "damaged.*FINE"),

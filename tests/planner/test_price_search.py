@@ -70,13 +70,13 @@ def test_the_tolerance_is_what_is_accepted(tolerance):
     assert (1.0 - tolerance) * 0.002 <= found.rate <= 0.002
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.004])
-def test_where_risk_is_always_low_it_is_free(rate):
+@pytest.mark.parametrize(("rate", "most"), [(0.0, 5), (0.004, 8)])
+def test_where_risk_is_always_low_it_is_free(rate, most):
     found = search(lambda price: rate)
     assert found.reached
     assert found.rate == rate
     assert found.price <= 9e-6 * (1 + 1e-12)  # nothing cheaper is looked for
-    assert len(found.tried) <= 8
+    assert len(found.tried) <= most
 
 
 @pytest.mark.parametrize("at", [3000.0, 0.003])
@@ -85,6 +85,16 @@ def test_a_plateau_is_crossed(at):
     assert found.reached
     assert 0.0085 <= found.rate <= 0.01
     assert len(found.tried) <= 8
+
+
+@pytest.mark.parametrize("top", [0.0102, 0.013, 0.05])
+@pytest.mark.parametrize("steep", [2.0, 8.0])
+def test_a_plateau_that_ends_in_a_fall(top, steep):
+    # The secant's worst case: flat on one side of the bracket, and far below on the other.
+    found = search(lambda price: top / (1.0 + (top / 0.01 - 1.0) * (price / 3000.0) ** steep))
+    assert found.reached
+    assert 3000.0 <= found.price <= 3000.0 * 1.2
+    assert 0.5 * 0.01 <= found.rate
 
 
 def test_a_floor_above_the_target_is_not_reached():
@@ -141,6 +151,17 @@ def test_a_failure_within_the_bracket_is_passed():
     assert found.tried[2].answer is None
     assert found.reached
     assert 0.85 * 0.005 <= found.rate <= 0.005
+
+
+def test_prices_that_fail_within_the_bracket_are_left_alone():
+    def solve(price, warm):
+        return None if 120.0 < price < 160.0 else price
+
+    found = search(power(300.0, 3.0), solve=solve)
+    failures = [trial for trial in found.tried if trial.answer is None]
+    assert 1 <= len(failures) <= 2
+    assert found.reached
+    assert 0.0085 <= found.rate <= 0.01
 
 
 def test_a_planner_that_always_fails():
@@ -200,6 +221,7 @@ def test_few_paths_leave_whole_counts_and_the_last_within_the_target_will_do():
     )
     assert found.rate * 2000 == pytest.approx(3.0)
     assert found.reached
+    assert len(found.tried) <= 6
 
 
 def test_each_solve_starts_from_the_answer_at_the_nearest_price():

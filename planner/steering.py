@@ -1,0 +1,341 @@
+"""From a plan of the mean to one that minimises an expected cost, at a price of risk or a risk.
+
+    minimise  E[ Σ dt (uᵀRu + H + Σ w max(0, c)²) + gᵀWg ] + w ∫ tr Σ dt,   P(constraint) ≤ δ
+
+to second order in the noise (:mod:`.expected`). The chance constraint is priced: ν times Boole's
+bound joins the cost, which allocates the risk over nodes and rows, and ν is searched for until
+simulated paths keep δ (:mod:`.price_search`, :mod:`.monte_carlo`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner.control_set import project_controls
+from slipcar.planner.expected import loop
+from slipcar.planner.expected.belief import feedback_effort
+from slipcar.planner.expected.guarded import Posed, posed
+from slipcar.planner.expected.losses import loss
+from slipcar.planner.expected.loop import Steered
+from slipcar.planner.expected.stakes import Stakes
+from slipcar.planner.method import driver
+from slipcar.planner.monte_carlo import violations
+from slipcar.planner.options import Options, check_count, check_number
+from slipcar.planner.price_search import PriceSearch, search_price
+from slipcar.planner.problem import Model
+from slipcar.planner.records import ExpectedCost
+from slipcar.planner.risk import PricedRate, Risk, check_risk, wilson_interval
+from slipcar.planner.status import Status
+
+Array = np.ndarray
+
+#: Paths that the search for a price looks at: so many violations are expected among them.
+_COUNTED = 400
+_LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
+#: Common random numbers of the search, and those of each verification, which it never saw.
+_SEARCH_SEED, _VERIFICATION_SEED = 0x51EE, 0xF5E5
+#: Standard deviations of Monte Carlo that the search keeps below δ, and verifications at most.
+_CAUTION, _VERIFICATIONS = 1.5, 3
+#: The first price, as a multiple of (cost of the nominal plan) / δ; and the dearest, of the first.
+_FIRST, _DEAREST = 0.02, 1e5
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What is asked for beyond the mean; see `slipcar.planner.plan`.
+
+    Attributes:
+        risk: δ, or None.
+        price: ν ≥ 0, where no risk is asked for.
+        feedback: whether gains are part of the plan.
+        expected: whether penalties are to be charged in expectation (they are with any other).
+        terminal_weight: W, scalar or (q,), or None for the problem's own.
+        episodes: paths for the verification.
+    """
+
+    risk: float | None = None
+    price: float | None = None
+    feedback: bool = False
+    expected: bool = False
+    terminal_weight: Any = None
+    episodes: int = 100_000
+
+    def __post_init__(self) -> None:
+        if self.risk is not None:
+            check_risk(self.risk)
+            if self.price is not None:
+                raise ValueError(
+                    "risk and risk_price exclude each other: risk=δ searches for the price"
+                )
+        if self.price is not None:
+            check_number("risk_price", self.price, zero_allowed=True)
+        check_count("risk_episodes", self.episodes, least=100)
+        for name in ("feedback", "expected"):
+            if getattr(self, name) not in (True, False):
+                raise ValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
+        if self.terminal_weight is not None and not self.wanted:
+            raise ValueError(
+                "terminal_weight is of expected costs: it needs feedback, expected, risk or "
+                "risk_price"
+            )
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anything is."""
+        return self.feedback or self.expected or self.risk is not None or self.price is not None
+
+    def check(self, options: Options, model: Model) -> None:
+        """Raise ValueError for what an expected cost cannot be combined with."""
+        if options.only_convex or options.method == "convex":
+            other = options.only_convex or "method='convex'"
+            raise ValueError(f"risk, feedback and expected cannot be combined with {other}")
+        if model.radius < np.inf:
+            raise ValueError("risk, feedback and expected know no control_radius: use bounds")
+        priced = self.risk is not None or bool(self.price)
+        if priced and getattr(model.problem, "constraint", None) is None:
+            raise ValueError(
+                f"risk needs the problem's constraint(t, x) -> (..., p), violated where > 0; "
+                f"{type(model.problem).__name__} has none"
+            )
+
+    def stakes(self, ready: Posed, q: int, w: float) -> Stakes:
+        """What to charge at price zero.
+
+        Raises:
+            ValueError: for a terminal weight of wrong shape or sign.
+        """
+        guarded = ready.guarded
+        given = self.terminal_weight
+        if given is None and self.feedback:
+            given = getattr(guarded.problem, "terminal_weight", None)
+        return Stakes(
+            weight=guarded.penalty_weight,
+            tail=guarded.is_constraint,
+            terminal=np.zeros(q) if given is None else _checked_terminal(given, q),
+            soft=given is not None,
+            feedback=self.feedback,
+            variance_weight=w,
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Steering:
+    """What came of a request.
+
+    Attributes:
+        found: where the iteration ended.
+        status: how planning ended.
+        cost: what is expected of the plan.
+        risk: where one was asked for.
+        message: what is lacking, or how a search went.
+        iterations: Newton steps in all.
+    """
+
+    found: Steered
+    status: Status
+    cost: ExpectedCost
+    risk: Risk | None
+    message: str
+    iterations: int
+
+
+def steer(problem: Any, options: Options, request: Request, x: Array, u: Array) -> Steering:
+    """Go on from a plan of the mean, x (N, n) and u (K, m)."""
+    ready = posed(problem, options.integrator)
+    iterate = _Iterator(ready, options, x, u)
+    q = len(np.asarray(ready.model.terminal(x[-1])))
+    stakes = request.stakes(ready, q, options.variance_weight)
+
+    def at(price: float) -> Stakes:
+        return priced(stakes, price)
+
+    if request.risk is None:
+        price = request.price or 0.0
+        found = iterate(at(price), None)
+        cost = expected_cost(ready.model, at(price), found)
+        return Steering(found, found.status, cost, None, "", iterate.steps)
+    return _calibrated(problem, request, ready, iterate, stakes)
+
+
+def priced(stakes: Stakes, price: float) -> Stakes:
+    """With constraints at this price."""
+    weight = np.where(stakes.tail, price, stakes.weight)
+    return dataclasses.replace(stakes, weight=weight)
+
+
+def expected_cost(model: Model, stakes: Stakes, found: Steered) -> ExpectedCost:
+    """What a plan costs in expectation, and the risk predicted for it."""
+    rows = loss(found.c, found.s, np.ones_like(found.c), stakes.tail).value
+    tails = loss_tail(found.c, found.s)
+    penalties = model.dt[:, None] * np.where(stakes.tail, 0.0, stakes.weight) * rows
+    g, G = np.asarray(model.terminal(found.x[-1])), np.asarray(model.terminal_jacobian(found.x[-1]))
+    spread = np.einsum("qi,ij,qj->q", G, found.covariance[-1], G)
+    running = found.running
+    if model.state_cost is not None and model.state_cost_derivatives is not None:
+        hessian = model.state_cost_derivatives(model.times[1:], found.x[1:])[1]
+        running += 0.5 * float(np.einsum("k,kij,kij", model.dt, hessian, found.covariance[1:]))
+    return ExpectedCost(
+        effort=found.effort,
+        feedback=feedback_effort(model, found.gains, found.covariance),
+        running=running,
+        penalty=float(penalties.sum()),
+        goal=float(np.dot(stakes.terminal, g * g + spread)),
+        risk=min(1.0, float(tails[:, stakes.tail].sum())),
+    )
+
+
+def _predicted(model: Model, stakes: Stakes, trial: Any) -> float | None:
+    if trial.answer is None:
+        return None
+    return expected_cost(model, priced(stakes, trial.price), trial.answer).risk
+
+
+def loss_tail(c: Array, s: Array) -> Array:
+    """Φ(c/s), the probability that a row is violated."""
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(c / s))
+
+
+def law(model: Model, found: Steered) -> Any:
+    """u = ū + K (x − μ) within bounds, as a function (t, x (..., n)) -> (..., m)."""
+    angles = tuple(getattr(model.problem, "angles", ()))
+    closed = bool(found.gains.any())
+    starts = model.times[:-1]
+
+    def control(t: Any, x: Array) -> Array:
+        k = int(np.argmin(np.abs(starts - t)))
+        if not closed:
+            return np.broadcast_to(found.u[k], (*np.shape(x)[:-1], found.u.shape[1]))
+        error = x - found.x[k]
+        for i in angles:
+            error[..., i] -= 2.0 * np.pi * np.round(error[..., i] / (2.0 * np.pi))
+        u = found.u[k] + error @ found.gains[k].T
+        return project_controls(u, model.lower, model.upper, model.radius)
+
+    return control
+
+
+class _Iterator:
+    """Runs the iteration, compiled where that is possible, from the nominal plan or a warm one."""
+
+    def __init__(self, ready: Posed, options: Options, x: Array, u: Array) -> None:
+        self.ready, self.steps = ready, 0
+        self._options, self._guess = options, (x, u)
+        self._iterate: Any = loop.iterate
+        self._functions = None
+        if options.compiled is not False and driver() is not None:
+            functions = ready.functions(x, u, native=True)
+            if functions.kernels is not None:
+                from slipcar.planner.expected import run
+
+                self._iterate, self._functions = run.iterate, functions
+            elif options.compiled:
+                raise ValueError(f"compiled=True, but {functions.reason}")
+        if self._functions is None:
+            self._functions = ready.functions(x, u, native=False)
+
+    def __call__(self, stakes: Stakes, warm: Steered | None) -> Steered:
+        x, u = self._guess if warm is None else (warm.x, warm.u)
+        found: Steered = self._iterate(
+            self.ready.model,
+            self._functions,
+            stakes,
+            x,
+            u,
+            tolerance=self._options.tolerance,
+            max_iterations=self._options.max_iterations,
+            warm=warm,
+        )
+        self.steps += found.iterations
+        return found
+
+
+def _calibrated(
+    problem: Any, request: Request, ready: Posed, iterate: _Iterator, stakes: Stakes
+) -> Steering:
+    """The price at which the risk is kept, the plan at that price, and the proof."""
+    model, delta = ready.model, float(request.risk or 0.0)
+    paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
+    noise = np.sqrt(delta * (1.0 - delta) * (1.0 / paths + 1.0 / request.episodes))
+    target = max(delta - _CAUTION * float(noise), 0.3 * delta)
+    simulated = 0.0
+
+    def rate(found: Steered, episodes: int, seed: int) -> float:
+        nonlocal simulated
+        began = time.perf_counter()
+        broken = violations(problem, law(model, found), episodes=episodes, seed=seed)
+        simulated += time.perf_counter() - began
+        return float(broken.mean())
+
+    def solve(price: float, warm: Steered | None) -> Steered | None:
+        for start in (warm, None) if warm is not None else (None,):
+            found = iterate(priced(stakes, price), start)
+            if found.status.ok:
+                return found
+        return None
+
+    base = iterate(stakes, None)
+    scale = max(abs(base.objective), 1e-6)
+    first = _FIRST * scale / delta
+    tried: list[PricedRate] = []
+    search: PriceSearch | None = None
+    verified, count = np.nan, 0
+    for attempt in range(_VERIFICATIONS):
+        search = search_price(
+            solve,
+            lambda found: rate(found, paths, _SEARCH_SEED),
+            target=target,
+            first=first,
+            largest=_DEAREST * first,
+        )
+        tried += [PricedRate(t.price, _predicted(model, stakes, t), t.rate) for t in search.tried]
+        if search.best is None:
+            break
+        verified = rate(search.best, request.episodes, _VERIFICATION_SEED + attempt)
+        count = round(verified * request.episodes)
+        if verified <= delta or not search.reached:
+            break
+        # Fresh paths disagree with those of the search: ask for less.
+        target, first = target * 0.9 * delta / verified, search.price
+    assert search is not None
+    found = search.best
+    if found is None:
+        cost = expected_cost(model, stakes, base)
+        say = "no plan was found at any price of risk"
+        return Steering(base, Status.SOLVER_FAILED, cost, None, say, iterate.steps)
+    at_price = priced(stakes, search.price)
+    cost = expected_cost(model, at_price, found)
+    risk = Risk(
+        requested=delta,
+        predicted=cost.risk,
+        verified=verified,
+        interval=wilson_interval(count, request.episodes),
+        episodes=request.episodes,
+        price=search.price,
+        reached=bool(search.reached and verified <= delta),
+        tried=tuple(tried),
+        simulation_time=simulated,
+    )
+    if risk.reached:
+        return Steering(found, found.status, cost, risk, "", iterate.steps)
+    say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
+    return Steering(found, Status.RISK_UNREACHABLE, cost, risk, say, iterate.steps)
+
+
+def _checked_terminal(given: Any, q: int) -> Array:
+    try:
+        weight = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"terminal_weight must be numbers, not {given!r}") from error
+    if weight.ndim == 0:
+        weight = np.full(q, float(weight))
+    if weight.shape != (q,) or not np.isfinite(weight).all() or (weight < 0.0).any():
+        raise ValueError(
+            f"terminal_weight must be a number or ({q},) numbers, finite and >= 0, not {given!r}"
+        )
+    return weight
