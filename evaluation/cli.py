@@ -1,4 +1,4 @@
-"""The command line, `slipcar compare|plan|simulate|train`: each a thin call of a function.
+"""The command line, `slipcar compare|frontier|plan|simulate|train`: each a thin call of a function.
 
 Bad values end in one line on the standard error and exit code 2; a plan that did not converge
 or a row that failed in exit code 1; an interruption in 130.
@@ -14,13 +14,15 @@ from collections.abc import Callable, Sequence
 #: help should not take a second.
 COMMANDS = {
     "compare": ("cli_compare", "compare", "the table and figures: SCP, feedback and PPO"),
+    "frontier": ("cli_frontier", "frontier", "what safety costs: effort against collision rate"),
     "plan": ("cli_plan", "plan", "plan one scenario: iterations, certificate, figures"),
     "simulate": ("cli_simulate", "simulate", "drive a few episodes; show, draw or film them"),
     "train": ("cli_train", "train", "train the PPO baseline on a scenario"),
 }
 _DESCRIPTION = """Stochastic SCP, a slipping car, and an honest comparison with PPO.
 
-    slipcar compare                      the paper's scenario, five controllers, figures
+    slipcar compare                      the paper's scenario, ten controllers, figures
+    slipcar frontier                     the price of safety: three curves, PPO, the paper
     slipcar plan --figures figures       one plan, what it proves, figures
     slipcar COMMAND --help               every option of a command"""
 

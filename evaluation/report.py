@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,15 +33,22 @@ class Column:
         text: from a row of `Comparison.frame` to what is printed.
         best: the key whose smallest (`sign` 1) or largest (−1) value is emphasised, or None.
         sign: see `best`.
+        marked: the key that says of each row whether it is emphasised, or None.
     """
 
     header: str
     text: Callable[[Any], str]
     best: str | None = None
     sign: int = 1
+    marked: str | None = None
 
 
-def _with_error(key: str) -> Callable[[Any], str]:
+#: Captions and columns of tables, in order.
+Captioned = Sequence[tuple[str, tuple[Column, ...]]]
+
+
+def with_error(key: str) -> Callable[[Any], str]:
+    """Text of a mean and its standard error."""
     return lambda row: f"{row[key]:.3f} ± {row[f'{key}_se']:.3f}"
 
 
@@ -73,10 +81,10 @@ def _duration(key: str) -> Callable[[Any], str]:
 
 
 LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
-TOTAL = Column("total cost", _with_error("total"), "total")
+TOTAL = Column("total cost", with_error("total"), "total")
 COLLISIONS = Column("collisions [%]", _collisions, "collision_rate")
 _PARTS = ("effort", "obstacle", "goal")
-COST = (LOOP, TOTAL, *(Column(part, _with_error(part)) for part in _PARTS), COLLISIONS)
+COST = (LOOP, TOTAL, *(Column(part, with_error(part)) for part in _PARTS), COLLISIONS)
 #: The same for a terminal, where columns are dear.
 COST_BRIEF = (LOOP, TOTAL, *(Column(part, _number(part, 3)) for part in _PARTS), COLLISIONS)
 DIFFERENCE = (
@@ -121,7 +129,7 @@ def tables(comparison: Comparison, brief: bool = False) -> list[tuple[str, tuple
 def cells(
     frame: pd.DataFrame, columns: tuple[Column, ...], emphasise: Callable[[str], str]
 ) -> list[list[str]]:
-    """Text of every cell, the name first; the best of a column is emphasised.
+    """Text of every cell, the name first; the best of a column, or those marked, are emphasised.
 
     Rows that print the same as the best are emphasised with it.
     """
@@ -133,6 +141,11 @@ def cells(
         if column.best is not None and sum(text != _NONE for text in texts) > 1:
             best = texts[int(np.nanargmin(column.sign * frame[column.best].astype(float)))]
             texts = [emphasise(text) if text == best else text for text in texts]
+        if column.marked is not None:
+            chosen = frame[column.marked].eq(True)
+            texts = [
+                emphasise(text) if mark else text for text, mark in zip(texts, chosen, strict=True)
+            ]
         printed.append(texts)
     return [list(row) for row in zip(*printed, strict=True)]
 
@@ -157,26 +170,38 @@ def machine(comparison: Comparison) -> str:
 
 def markdown(comparison: Comparison) -> str:
     """Tables in Markdown with their captions, errors and provenance."""
-    from tabulate import tabulate
-
-    parts = [setting(comparison)]
-    for caption, columns in tables(comparison):
-        rows = cells(comparison.frame, columns, lambda text: f"**{text}**")
-        headers = ["controller", *(column.header for column in columns)]
-        parts.append(f"**{caption}**")
-        parts.append(tabulate(rows, headers, tablefmt="github", disable_numparse=True))
+    parts = [setting(comparison), *markdown_tables(comparison.frame, tables(comparison))]
     parts += [f"`{name}` did not finish: {text}" for name, text in comparison.errors.items()]
     parts.append(f"Computed on {machine(comparison)}")
     return "\n\n".join(parts) + "\n"
 
 
+def markdown_tables(frame: pd.DataFrame, captioned: Captioned) -> list[str]:
+    """Captions and tables in Markdown, in turn."""
+    from tabulate import tabulate
+
+    parts = []
+    for caption, columns in captioned:
+        rows = cells(frame, columns, lambda text: f"**{text}**")
+        headers = ["controller", *(column.header for column in columns)]
+        parts.append(f"**{caption}**")
+        parts.append(tabulate(rows, headers, tablefmt="github", disable_numparse=True))
+    return parts
+
+
 def latex(comparison: Comparison) -> str:
     r"""Tables in LaTeX; they need `\usepackage{booktabs}`."""
+    parts = [f"% {setting(comparison)}", f"% {machine(comparison)}"]
+    return "\n".join([*parts, *latex_tables(comparison.frame, tables(comparison))])
+
+
+def latex_tables(frame: pd.DataFrame, captioned: Captioned) -> list[str]:
+    """Floating tables in LaTeX."""
     import pandas as pd
 
-    parts = [f"% {setting(comparison)}", f"% {machine(comparison)}"]
-    for caption, columns in tables(comparison):
-        rows = cells(comparison.frame, columns, lambda text: f"\x02{text}\x03")
+    parts = []
+    for caption, columns in captioned:
+        rows = cells(frame, columns, lambda text: f"\x02{text}\x03")
         headers = ["controller", *(column.header for column in columns)]
         escaped = pd.DataFrame([[_tex(text) for text in row] for row in rows])
         escaped.columns = pd.Index([_tex(text) for text in headers])
@@ -189,13 +214,14 @@ def latex(comparison: Comparison) -> str:
                 position="htb",
             )
         )
-    return "\n".join(parts)
+    return parts
 
 
 _TEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "±": r"$\pm$", "Δ": r"$\Delta$", "µ": r"\textmu{}", "“": "``", "”": "''", "–": "--",
+    "±": r"$\pm$", "Δ": r"$\Delta$", "µ": r"\textmu{}",
+    "≤": r"$\leq$", "ν": r"$\nu$", "“": "``", "”": "''", "–": "--",
     "\x02": r"\textbf{", "\x03": "}",
 }  # fmt: skip
 
@@ -206,19 +232,30 @@ def _tex(text: str) -> str:
 
 def terminal(comparison: Comparison) -> Group:
     """Tables for a terminal, to be printed by a rich console."""
-    from rich import box
     from rich.console import Group
-    from rich.table import Table
     from rich.text import Text
 
     parts: list[Any] = [Text(setting(comparison)), Text()]
-    for caption, columns in tables(comparison, brief=True):
+    parts += terminal_tables(comparison.frame, tables(comparison, brief=True))
+    for name, message in comparison.errors.items():
+        parts.append(Text(f"{name} did not finish: {message}", style="bold red"))
+    return Group(*parts)
+
+
+def terminal_tables(frame: pd.DataFrame, captioned: Captioned) -> list[Any]:
+    """Captions and tables of rich, in turn."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    parts: list[Any] = []
+    for caption, columns in captioned:
         parts.append(Text(caption, style="bold"))
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="")
         table.add_column(Text("controller"), no_wrap=True)
         for i, column in enumerate(columns):
             table.add_column(Text(column.header), justify="left" if i == 0 else "right")
-        for row in cells(comparison.frame, columns, lambda text: f"\x02{text}"):
+        for row in cells(frame, columns, lambda text: f"\x02{text}"):
             table.add_row(
                 *(
                     Text(text[1:], style="bold green") if text[:1] == "\x02" else Text(text)
@@ -226,14 +263,17 @@ def terminal(comparison: Comparison) -> Group:
                 )
             )
         parts.append(table)
-    for name, message in comparison.errors.items():
-        parts.append(Text(f"{name} did not finish: {message}", style="bold red"))
-    return Group(*parts)
+    return parts
 
 
-def json_text(comparison: Comparison) -> str:
-    """Everything needed to repeat the table, and its raw numbers, as JSON."""
-    frame = comparison.frame
+def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
+    """Everything needed to repeat the table, and its raw numbers, as JSON.
+
+    Args:
+        comparison: what was run.
+        frame: a row for each controller; None takes the comparison's own.
+    """
+    frame = comparison.frame if frame is None else frame
     data = {
         "scenario": comparison.scenario.to_dict(),
         "seed": comparison.seed,
@@ -266,25 +306,40 @@ def _plain(value: Any) -> Any:
 
 def save(comparison: Comparison, folder: Path, figures: bool) -> list[Path]:
     """Write the tables, the JSON and the figures; see `Comparison.save`."""
+    written = write_texts(
+        folder,
+        {
+            "table.md": comparison.to_markdown(),
+            "table.csv": comparison.frame.to_csv(),
+            "table.tex": comparison.to_latex(),
+            "results.json": comparison.to_json(),
+        },
+    )
+    if figures:
+        with tables_are_in(folder):
+            from slipcar.evaluation import plots
+        written += plots.save_all(comparison, folder)
+    return written
+
+
+def write_texts(folder: Path, texts: dict[str, str]) -> list[Path]:
+    """Write files, name -> text, into a folder that is made if need be; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {
-        "table.md": comparison.to_markdown(),
-        "table.csv": comparison.frame.to_csv(),
-        "table.tex": comparison.to_latex(),
-        "results.json": comparison.to_json(),
-    }
     written = []
     for name, text in texts.items():
         path = folder / name
         write_atomically(path, text.encode())
         written.append(path)
-    if figures:
-        try:
-            from slipcar.evaluation import plots
-        except ImportError as error:
-            raise ImportError(
-                f"figures need matplotlib ({error}): pip install 'slipcar[plot]', or do without "
-                f"(figures=False, --no-figures); the tables are in {folder}"
-            ) from error
-        written += plots.save_all(comparison, folder)
     return written
+
+
+@contextlib.contextmanager
+def tables_are_in(folder: Path) -> Iterator[None]:
+    """Where matplotlib is missing: say so, how to do without, and that the tables are there."""
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"figures need matplotlib ({error}): pip install 'slipcar[plot]', or do without "
+            f"(figures=False, --no-figures); the tables are in {folder}"
+        ) from error

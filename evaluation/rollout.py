@@ -50,7 +50,10 @@ class Controller(Protocol):
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """Actions in [−1, 1], (rows, 2), and the next hidden state."""
+        """Actions in [−1, 1], (rows, 2), and the next hidden state.
+
+        A state may have `failures` (rows,): solves that failed so far in each episode.
+        """
         ...
 
 
@@ -63,12 +66,15 @@ class Step:
         control: u_k, (rows, 2) [m/s², rad/s²].
         moved: where it led; `moved.state` is x_{k+1}, (rows, 5).
         seconds: spent inside `predict`.
+        failures: solves that failed so far in each episode, (rows,); None if its state does not
+            say.
     """
 
     index: int
     control: np.ndarray
     moved: Transition
     seconds: float
+    failures: np.ndarray | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,10 +84,12 @@ class Rollout:
     Attributes:
         metrics: per-episode arrays.
         inference_time: seconds inside `predict` per step and episode.
+        failures: solves that failed on the way, if the controller's state counts them; else None.
     """
 
     metrics: EpisodeMetrics
     inference_time: float
+    failures: int | None = None
 
 
 def check_counts(
@@ -141,14 +149,18 @@ def rollout(
         per_task = -(-batch_size // BLOCK)
     tasks = [range(b, min(b + per_task, blocks)) for b in range(0, blocks, per_task)]
     parts, seconds, rows = [], 0.0, 0
-    for part, part_seconds in _run(tasks, n_jobs, (controller, scenario, episodes, seed, substeps)):
+    failures: int | None = None
+    common = (controller, scenario, episodes, seed, substeps)
+    for part, part_seconds, part_failures in _run(tasks, n_jobs, common):
         parts.append(part)
         seconds += part_seconds
         rows += len(part)
+        if part_failures is not None:
+            failures = (failures or 0) + part_failures
         if progress is not None:
             progress(len(part))
     steps = scenario.nodes - 1
-    return Rollout(EpisodeMetrics.concatenate(parts), seconds / (rows * steps))
+    return Rollout(EpisodeMetrics.concatenate(parts), seconds / (rows * steps), failures)
 
 
 def sample_paths(
@@ -226,7 +238,9 @@ def play(
             action, hidden[c] = _checked_answer(controller, scenario, answer, chunk, k, first)
             control[here] = control_from_action(scenario, action, (chunk,))
         moved = transition(scenario, x, control, variates[:rows])
-        yield Step(k, control, moved, seconds)
+        counted = [getattr(state, "failures", None) for state in hidden]
+        failures = None if any(c is None for c in counted) else np.concatenate(counted)
+        yield Step(k, control, moved, seconds, failures)
         x = moved.state
         starts = np.zeros(chunk, dtype=bool)
 
@@ -272,7 +286,9 @@ def check_controller(controller: Any) -> None:
         raise ValueError(f"{controller_name(controller)}.rows must divide {BLOCK}, not {rows}")
 
 
-def _run(tasks: list[range], n_jobs: int, common: tuple) -> Iterator[tuple[EpisodeMetrics, float]]:
+def _run(
+    tasks: list[range], n_jobs: int, common: tuple
+) -> Iterator[tuple[EpisodeMetrics, float, int | None]]:
     if n_jobs == 1 or len(tasks) == 1:
         with _one_thread():
             for task in tasks:
@@ -293,9 +309,10 @@ def _measure(
     episodes: int,
     seed: int,
     substeps: int,
-) -> tuple[EpisodeMetrics, float]:
-    """Metrics of the episodes in `blocks`, and the seconds of `predict` they account for."""
+) -> tuple[EpisodeMetrics, float, int | None]:
+    """Metrics of the episodes in `blocks`; seconds of `predict` and failures they account for."""
     parts, seconds = [], 0.0
+    failures: int | None = None
     for block in blocks:
         wanted = min(BLOCK, episodes - block * BLOCK)
         effort, obstacle = np.zeros(()), np.zeros(())
@@ -308,7 +325,9 @@ def _measure(
             seconds += step.seconds * wanted / len(step.control)
         whole = EpisodeMetrics.of(scenario, effort, obstacle, clearance, moved.state)
         parts.append(whole.first(wanted))
-    return EpisodeMetrics.concatenate(parts), seconds
+        if step.failures is not None:
+            failures = (failures or 0) + int(step.failures[:wanted].sum())
+    return EpisodeMetrics.concatenate(parts), seconds, failures
 
 
 def _checked_answer(

@@ -29,6 +29,9 @@ from slipcar.planner.warm_start import given_guess, run_guarded
 
 Array = np.ndarray
 
+#: Guesses where noise has a cost: the cheapest way round the obstacles may be the riskiest.
+_STARTS = 6
+
 
 def plan(
     problem: Problem,
@@ -43,7 +46,7 @@ def plan(
     terminal_tolerance: float = 0.0,
     integrator: str = "euler",
     compiled: bool | None = None,
-    starts: int = 1,
+    starts: int | None = None,
     guess: Plan | tuple[Array, Array] | None = None,
     cold_start: str = "auto",
     free_first: bool | None = None,
@@ -89,7 +92,7 @@ def plan(
         compiled: run Newton's method compiled by numba, the same steps to rounding errors. None:
             where numba is installed and the problem's functions can be traced, and no callback
             is to be called on the way.
-        starts: guesses to try, ≥ 1: the problem's own (with and without its penalties at first) and
+        starts: guesses to try, ≥ 1; None is 1, or 6 for expected costs: the problem's own (with and without its penalties at first) and
             others round the obstacles; the best plan is returned and `alternatives` says what
             became of each.
         guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
@@ -171,6 +174,8 @@ def plan(
         compiled=compiled,
         callback=callback,
     )
+    if starts is None:
+        starts = _STARTS if request.wanted and guess is None else 1
     check_count("starts", starts)
     check_choice("cold_start", cold_start, ("auto", "always", "never"))
     if free_first not in (None, True, False):
@@ -217,8 +222,11 @@ def plan(
             return found
         return solve(model, options, x, u, free_first=first)
 
+    candidates: tuple[Outcome, ...] = ()
     if starts > 1:
-        x, found, more["alternatives"] = multistart(model, options, starts)
+        tried = multistart(model, options, starts)
+        x, found, more["alternatives"] = tried.guess, tried.best, tried.alternatives
+        candidates = tried.different
         if shooting:
             found = run(found.x, found.u)
     elif guess is None:
@@ -234,7 +242,7 @@ def plan(
         )
         problem = reposed(problem, times=model.times)
     if request.wanted and found.status not in (Status.STOPPED, Status.SOLVER_FAILED):
-        steered = steer(problem, options, request, found.x, found.u)
+        steered = steer(problem, options, request, candidates or (found,))
         return build_steered(
             steered,
             found,

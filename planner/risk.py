@@ -102,7 +102,7 @@ class Risk:
 def check_risk(delta: Any) -> None:
     """Raise ValueError unless δ is a number in (0, 1)."""
     # Booleans are numbers to Python, but 0 or 1, which are no risks; NaN is in no interval.
-    if not (isinstance(delta, numbers.Real) and 0.0 < delta < 1.0):
+    if not (isinstance(delta, numbers.Real) and 0.0 < float(delta) < 1.0):
         raise ValueError(f"risk must be a probability in (0, 1), e.g. 0.01 for 1 %, not {delta!r}")
 
 

@@ -79,15 +79,25 @@ def initial_guesses(model: Model, count: int) -> list[Guess]:
     return found[:count]
 
 
-def multistart(
-    model: Model, options: Options, count: int
-) -> tuple[Array, Outcome, tuple[Alternative, ...]]:
-    """Plan from several guesses, all at once where that is possible.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Starts:
+    """What several guesses led to.
 
-    Returns:
-        The states of the guess that led to the best outcome, that outcome, and all that was
-        tried, the best first; the same answers are marked.
+    Attributes:
+        guess: states of the guess that led to the best outcome, (N, n).
+        best: that outcome.
+        different: outcomes that are not the same answer, the best first.
+        alternatives: all that was tried, the best first; the same answers are marked.
     """
+
+    guess: Array
+    best: Outcome
+    different: tuple[Outcome, ...]
+    alternatives: tuple[Alternative, ...]
+
+
+def multistart(model: Model, options: Options, count: int) -> Starts:
+    """Plan from several guesses, all at once where that is possible."""
     guesses = initial_guesses(model, count)
     tasks = [Task(model, guess.states, guess.controls, guess.free_first) for guess in guesses]
     # One thread: several would not pay for a handful of problems.
@@ -112,7 +122,12 @@ def multistart(
         else:
             row = dataclasses.replace(row, same_as=guesses[twin].label)
         rows.append(row)
-    return guesses[best].states, outcomes[best], tuple(rows)
+    return Starts(
+        guess=guesses[best].states,
+        best=outcomes[best],
+        different=tuple(outcomes[i] for i in different),
+        alternatives=tuple(rows),
+    )
 
 
 def _others(model: Model, x: Array, u: Array, count: int) -> Iterator[tuple[str, Array, Array]]:

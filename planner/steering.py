@@ -11,21 +11,20 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from slipcar.planner.control_set import project_controls
-from slipcar.planner.expected import loop
-from slipcar.planner.expected.belief import feedback_effort
+from slipcar.planner.expected.field import Field, expected_cost, priced
 from slipcar.planner.expected.guarded import Posed, posed
-from slipcar.planner.expected.losses import loss
 from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.stakes import Stakes
-from slipcar.planner.method import driver
 from slipcar.planner.monte_carlo import violations
 from slipcar.planner.options import Options, check_count, check_number
-from slipcar.planner.price_search import PriceSearch, search_price
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.price_search import search_price
 from slipcar.planner.problem import Model
 from slipcar.planner.records import ExpectedCost
 from slipcar.planner.risk import PricedRate, Risk, check_risk, wilson_interval
@@ -40,6 +39,8 @@ _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
 _SEARCH_SEED, _VERIFICATION_SEED = 0x51EE, 0xF5E5
 #: Standard deviations of Monte Carlo that the search keeps below δ, and verifications at most.
 _CAUTION, _VERIFICATIONS = 1.5, 3
+#: Boole's bound overestimates, as nodes are correlated, by less than this.
+_BOOLE = 10.0
 #: The first price, as a multiple of (cost of the nominal plan) / δ; and the dearest, of the first.
 _FIRST, _DEAREST = 0.02, 1e5
 
@@ -143,62 +144,27 @@ class Steering:
     iterations: int
 
 
-def steer(problem: Any, options: Options, request: Request, x: Array, u: Array) -> Steering:
-    """Go on from a plan of the mean, x (N, n) and u (K, m)."""
+def steer(
+    problem: Any, options: Options, request: Request, candidates: Sequence[Outcome]
+) -> Steering:
+    """Go on from plans of the mean, the best first; which is taken is decided by expected cost."""
     ready = posed(problem, options.integrator)
-    iterate = _Iterator(ready, options, x, u)
-    q = len(np.asarray(ready.model.terminal(x[-1])))
+    first = candidates[0]
+    q = len(np.asarray(ready.model.terminal(first.x[-1])))
     stakes = request.stakes(ready, q, options.variance_weight)
-
-    def at(price: float) -> Stakes:
-        return priced(stakes, price)
-
+    field = Field(ready, options, stakes, [(c.x, c.u) for c in candidates])
     if request.risk is None:
         price = request.price or 0.0
-        found = iterate(at(price), None)
-        cost = expected_cost(ready.model, at(price), found)
-        return Steering(found, found.status, cost, None, "", iterate.steps)
-    return _calibrated(problem, request, ready, iterate, stakes)
-
-
-def priced(stakes: Stakes, price: float) -> Stakes:
-    """With constraints at this price."""
-    weight = np.where(stakes.tail, price, stakes.weight)
-    return dataclasses.replace(stakes, weight=weight)
-
-
-def expected_cost(model: Model, stakes: Stakes, found: Steered) -> ExpectedCost:
-    """What a plan costs in expectation, and the risk predicted for it."""
-    rows = loss(found.c, found.s, np.ones_like(found.c), stakes.tail).value
-    tails = loss_tail(found.c, found.s)
-    penalties = model.dt[:, None] * np.where(stakes.tail, 0.0, stakes.weight) * rows
-    g, G = np.asarray(model.terminal(found.x[-1])), np.asarray(model.terminal_jacobian(found.x[-1]))
-    spread = np.einsum("qi,ij,qj->q", G, found.covariance[-1], G)
-    running = found.running
-    if model.state_cost is not None and model.state_cost_derivatives is not None:
-        hessian = model.state_cost_derivatives(model.times[1:], found.x[1:])[1]
-        running += 0.5 * float(np.einsum("k,kij,kij", model.dt, hessian, found.covariance[1:]))
-    return ExpectedCost(
-        effort=found.effort,
-        feedback=feedback_effort(model, found.gains, found.covariance),
-        running=running,
-        penalty=float(penalties.sum()),
-        goal=float(np.dot(stakes.terminal, g * g + spread)),
-        risk=min(1.0, float(tails[:, stakes.tail].sum())),
-    )
+        found = field.solve(price) or field.attempt
+        cost = expected_cost(ready.model, priced(stakes, price), found)
+        return Steering(found, found.status, cost, None, "", field.steps)
+    return _calibrated(problem, request, ready, field, stakes)
 
 
 def _predicted(model: Model, stakes: Stakes, trial: Any) -> float | None:
     if trial.answer is None:
         return None
     return expected_cost(model, priced(stakes, trial.price), trial.answer).risk
-
-
-def loss_tail(c: Array, s: Array) -> Array:
-    """Φ(c/s), the probability that a row is violated."""
-    from scipy.special import ndtr
-
-    return np.asarray(ndtr(c / s))
 
 
 def law(model: Model, found: Steered) -> Any:
@@ -220,43 +186,8 @@ def law(model: Model, found: Steered) -> Any:
     return control
 
 
-class _Iterator:
-    """Runs the iteration, compiled where that is possible, from the nominal plan or a warm one."""
-
-    def __init__(self, ready: Posed, options: Options, x: Array, u: Array) -> None:
-        self.ready, self.steps = ready, 0
-        self._options, self._guess = options, (x, u)
-        self._iterate: Any = loop.iterate
-        self._functions = None
-        if options.compiled is not False and driver() is not None:
-            functions = ready.functions(x, u, native=True)
-            if functions.kernels is not None:
-                from slipcar.planner.expected import run
-
-                self._iterate, self._functions = run.iterate, functions
-            elif options.compiled:
-                raise ValueError(f"compiled=True, but {functions.reason}")
-        if self._functions is None:
-            self._functions = ready.functions(x, u, native=False)
-
-    def __call__(self, stakes: Stakes, warm: Steered | None) -> Steered:
-        x, u = self._guess if warm is None else (warm.x, warm.u)
-        found: Steered = self._iterate(
-            self.ready.model,
-            self._functions,
-            stakes,
-            x,
-            u,
-            tolerance=self._options.tolerance,
-            max_iterations=self._options.max_iterations,
-            warm=warm,
-        )
-        self.steps += found.iterations
-        return found
-
-
 def _calibrated(
-    problem: Any, request: Request, ready: Posed, iterate: _Iterator, stakes: Stakes
+    problem: Any, request: Request, ready: Posed, field: Field, stakes: Stakes
 ) -> Steering:
     """The price at which the risk is kept, the plan at that price, and the proof."""
     model, delta = ready.model, float(request.risk or 0.0)
@@ -272,59 +203,59 @@ def _calibrated(
         simulated += time.perf_counter() - began
         return float(broken.mean())
 
-    def solve(price: float, warm: Steered | None) -> Steered | None:
-        for start in (warm, None) if warm is not None else (None,):
-            found = iterate(priced(stakes, price), start)
-            if found.status.ok:
-                return found
-        return None
+    def answer(found: Steered, price: float, kept: bool) -> Steering:
+        cost = expected_cost(model, priced(stakes, price), found)
+        risk = Risk(
+            requested=delta,
+            predicted=cost.risk,
+            verified=verified,
+            interval=wilson_interval(round(verified * request.episodes), request.episodes),
+            episodes=request.episodes,
+            price=price,
+            reached=kept,
+            tried=tuple(tried),
+            simulation_time=simulated,
+        )
+        if kept:
+            return Steering(found, found.status, cost, risk, "", field.steps)
+        say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
+        return Steering(found, Status.RISK_UNREACHABLE, cost, risk, say, field.steps)
 
-    base = iterate(stakes, None)
-    scale = max(abs(base.objective), 1e-6)
-    first = _FIRST * scale / delta
     tried: list[PricedRate] = []
-    search: PriceSearch | None = None
-    verified, count = np.nan, 0
+    free = field.solve(0.0)
+    if free is not None:
+        # Perhaps what is cheapest is safe enough: Boole's bound says whether to look.
+        cost = expected_cost(model, stakes, free)
+        if cost.risk <= _BOOLE * delta:
+            share = rate(free, paths, _SEARCH_SEED)
+            tried.append(PricedRate(0.0, cost.risk, share))
+            if share <= target:
+                verified = rate(free, request.episodes, _VERIFICATION_SEED)
+                if verified <= delta:
+                    return answer(free, 0.0, True)
+    scale = max(abs(field.attempt.effort), 1e-6)
+    first = _FIRST * scale / delta
     for attempt in range(_VERIFICATIONS):
         search = search_price(
-            solve,
+            lambda price, _: field.solve(price),
             lambda found: rate(found, paths, _SEARCH_SEED),
             target=target,
             first=first,
             largest=_DEAREST * first,
+            resolution=1.0 / paths,
         )
         tried += [PricedRate(t.price, _predicted(model, stakes, t), t.rate) for t in search.tried]
-        if search.best is None:
-            break
-        verified = rate(search.best, request.episodes, _VERIFICATION_SEED + attempt)
-        count = round(verified * request.episodes)
+        found = search.best
+        if found is None:
+            cost = expected_cost(model, stakes, field.attempt)
+            say = "no plan was found at any price of risk"
+            return Steering(field.attempt, Status.SOLVER_FAILED, cost, None, say, field.steps)
+        verified = rate(found, request.episodes, _VERIFICATION_SEED + attempt)
         if verified <= delta or not search.reached:
             break
         # Fresh paths disagree with those of the search: ask for less.
         target, first = target * 0.9 * delta / verified, search.price
-    assert search is not None
-    found = search.best
-    if found is None:
-        cost = expected_cost(model, stakes, base)
-        say = "no plan was found at any price of risk"
-        return Steering(base, Status.SOLVER_FAILED, cost, None, say, iterate.steps)
-    at_price = priced(stakes, search.price)
-    cost = expected_cost(model, at_price, found)
-    risk = Risk(
-        requested=delta,
-        predicted=cost.risk,
-        verified=verified,
-        interval=wilson_interval(count, request.episodes),
-        episodes=request.episodes,
-        price=search.price,
-        reached=bool(search.reached and verified <= delta),
-        tried=tuple(tried),
-        simulation_time=simulated,
-    )
-    if risk.reached:
-        return Steering(found, found.status, cost, risk, "", iterate.steps)
-    say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
-    return Steering(found, Status.RISK_UNREACHABLE, cost, risk, say, iterate.steps)
+    return answer(found, search.price, bool(search.reached and verified <= delta))
 
 
 def _checked_terminal(given: Any, q: int) -> Array:

@@ -14,20 +14,18 @@ import numba
 import numpy as np
 
 from slipcar.planner.expected.arrays import (
-    active_bounds,
-    clip,
     cost,
     fill_losses,
-    load,
     model_change,
     priced,
     propagate,
     quadratic,
-    respond,
 )
 from slipcar.planner.newton import compiled as newton
 from slipcar.planner.newton.caching import stamp
+from slipcar.planner.newton.compiled import gramian_trace, half_largest
 from slipcar.planner.newton.iterate_arrays import evaluate, inconsistency, storage
+from slipcar.planner.newton.model_arrays import active_bounds, clip, load, respond
 from slipcar.planner.newton.riccati import SOFTNESS, solve_lq, workspace
 from slipcar.planner.newton.sweep import sweep
 
@@ -35,30 +33,9 @@ CONVERGED, MAX_ITERATIONS, STALLED, NO_STEP, NOT_FINITE = range(5)
 
 
 @numba.njit(error_model="numpy")
-def _half_largest(array):
-    """Half of the largest absolute value."""
-    largest = 0.0
-    for value in array.flat:
-        largest = max(largest, 0.5 * abs(value))
-    return largest
-
-
-@numba.njit(error_model="numpy")
-def _gramian_trace(A, B, dt, R, G):
-    """`lq.gramian_trace`."""
-    inverse = np.linalg.inv(R)
-    Phi, total = G.copy(), 0.0
-    for k in range(len(A) - 1, -1, -1):
-        pushed = Phi @ B[k]
-        total += np.sum(pushed * (pushed @ inverse)) / (2.0 * dt[k])
-        Phi = Phi @ A[k]
-    return total
-
-
-@numba.njit(error_model="numpy")
 def _consistent(at, soft, tuning):
     """`loop._consistent`."""
-    size = 1.0 + 2.0 * _half_largest(at[14])
+    size = 1.0 + 2.0 * half_largest(at[14])
     if not soft and at[19][5] > tuning.feasibility * size:
         return False
     return inconsistency(at) <= tuning.consistency * size
@@ -107,7 +84,7 @@ def _iterate(
     # Where the end is charged its condition is left out: a system so soft has the multiplier 0.
     kappa, seen = 0.0, 1.0 / SOFTNESS
     if not soft:
-        gramian = _gramian_trace(at[1], at[2], dt, R, at[13])
+        gramian = gramian_trace(at[1], at[2], dt, R, at[13])
         if gramian > 0.0:
             kappa = tuning.terminal_curvature * q_ / gramian
         seen = gramian / (1.0 + kappa * gramian)
@@ -125,7 +102,7 @@ def _iterate(
         for _ in range(tuning.inertia_trials):
             for bound_round in range(tuning.bound_rounds):
                 load(
-                    dt, at, Q, q, Rk, r, shift, kappa, low, high, low_bound, high_bound,
+                    dt, none, at, Q, q, Rk, r, shift, kappa, low, high, low_bound, high_bound,
                     stiffness, Qs, qs, Rs, rs,
                 )  # fmt: skip
                 if addresses[6] != 0:
@@ -156,7 +133,7 @@ def _iterate(
         if not same:
             respond(A, B, f, de, ee)
         change, step, length, radius = model_change(dt, R, Q, q, Rk, r, S, de, ee)
-        price, dear = _half_largest(next_adjoint), 0.0 if soft else _half_largest(next_nu)
+        price, dear = half_largest(next_adjoint), 0.0 if soft else half_largest(next_nu)
         here = cost(at, dt, weight, tail, W, soft, s, P)
         value, gap, miss = priced(at, next_adjoint, next_nu, soft)
         lacking = price * gap + dear * miss

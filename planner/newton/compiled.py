@@ -27,6 +27,7 @@ from slipcar.planner.newton.iterate_arrays import (
 )
 from slipcar.planner.newton.model_arrays import (
     active_bounds,
+    clip,
     load,
     model_cost,
     quadratic,
@@ -63,7 +64,7 @@ COLUMNS = (
 
 
 @numba.njit(error_model="numpy")
-def _half_largest(array):
+def half_largest(array):
     """Half of the largest absolute value."""
     largest = 0.0
     for value in array.flat:
@@ -72,7 +73,7 @@ def _half_largest(array):
 
 
 @numba.njit(error_model="numpy")
-def _gramian_trace(A, B, dt, R, G):
+def gramian_trace(A, B, dt, R, G):
     """`lq.gramian_trace`."""
     K = len(A)
     inverse = np.linalg.inv(R)
@@ -88,7 +89,7 @@ def _gramian_trace(A, B, dt, R, G):
 def _consistent(at, tuning):
     """`loop._consistent`."""
     x, values = at[14], at[19]
-    size = 1.0 + 2.0 * _half_largest(x)
+    size = 1.0 + 2.0 * half_largest(x)
     return values[5] <= tuning.feasibility * size and inconsistency(at) <= tuning.consistency * size
 
 
@@ -117,6 +118,8 @@ def _iterate(
     last_adjoint, last_nu = np.zeros((K, n)), np.zeros(t)
     low, high = np.zeros((K, m), dtype=np.bool_), np.zeros((K, m), dtype=np.bool_)
     low_new, high_new = low.copy(), high.copy()
+    low_bound, high_bound = np.empty((K, m)), np.empty((K, m))
+    low_bound[:], high_bound[:] = lower, upper
     unit = 0.0  # of a shift
     for i in range(m):
         unit = max(unit, R[i, i])
@@ -131,7 +134,7 @@ def _iterate(
     started = ticks()
     if not evaluate(addresses, parameters, times, dt, R, weight, w, at):
         return NOT_FINITE, 0
-    gramian = _gramian_trace(at[1], at[2], dt, R, at[13])
+    gramian = gramian_trace(at[1], at[2], dt, R, at[13])
     if gramian > 0.0:
         kappa = tuning.terminal_curvature * t / gramian
     for iteration in range(max_iterations):
@@ -159,7 +162,8 @@ def _iterate(
             for bound_round in range(tuning.bound_rounds):
                 load(
                     dt, hinges, at, Q, q, Rk, r, shift if curved else 0.0,
-                    kappa if curved else 0.0, low, high, lower, upper, stiffness, Qs, qs, Rs, rs,
+                    kappa if curved else 0.0, low, high, low_bound, high_bound, stiffness, Qs, qs,
+                    Rs, rs,
                 )  # fmt: skip
                 if addresses[6] != 0:
                     convex = sweep(
@@ -173,7 +177,7 @@ def _iterate(
                 solves += 1
                 if not convex:
                     break
-                same = active_bounds(u, ee, lower, upper, low, high, low_new, high_new)
+                same = active_bounds(u, ee, low_bound, high_bound, low, high, low_new, high_new)
                 if same:
                     break
                 if bound_round < tuning.bound_rounds - 1:
@@ -185,10 +189,11 @@ def _iterate(
         if not convex:
             status = NO_STEP
             break
+        clip(u, ee, low_bound, high_bound)
         if not same:
-            respond(A, B, f, u, lower, upper, de, ee)
-        model, step, radius = model_cost(dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee)
-        price, dear = _half_largest(adjoint), _half_largest(nu)
+            respond(A, B, f, de, ee)
+        model, step, radius = model_cost(dt, weight, at, Q, q, Rk, r, S, de, ee)
+        price, dear = half_largest(adjoint), half_largest(nu)
         before, gap, miss = lagrangian(at, adjoint, nu, w, dt, at[20])
         gained, lacking = before - model, price * gap + dear * miss
         factor = 1.0

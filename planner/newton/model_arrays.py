@@ -81,10 +81,10 @@ def load(
             Rs[k, i, i] += 2.0 * dt[k] * shift
             if high[k, i]:
                 Rs[k, i, i] += stiffness
-                rs[k, i] -= stiffness * (upper[i] - u[k, i])
+                rs[k, i] -= stiffness * (upper[k, i] - u[k, i])
             elif low[k, i]:
                 Rs[k, i, i] += stiffness
-                rs[k, i] -= stiffness * (lower[i] - u[k, i])
+                rs[k, i] -= stiffness * (lower[k, i] - u[k, i])
     if kappa > 0.0:
         for j in range(len(g)):
             for i in range(n):
@@ -97,23 +97,29 @@ def load(
 
 @numba.njit(error_model="numpy")
 def active_bounds(u, e, lower, upper, low, high, low_new, high_new):
-    """Bounds that the step passes; whether they are those it was computed with."""
+    """Bounds (K, m) that the step passes; whether they are those it was computed with."""
     same = True
     for k in range(u.shape[0]):
         for i in range(u.shape[1]):
-            below, above = u[k, i] + e[k, i] < lower[i], u[k, i] + e[k, i] > upper[i]
+            below, above = u[k, i] + e[k, i] < lower[k, i], u[k, i] + e[k, i] > upper[k, i]
             same = same and below == low[k, i] and above == high[k, i]
             low_new[k, i], high_new[k, i] = below, above
     return same
 
 
 @numba.njit(error_model="numpy")
-def respond(A, B, f, u, lower, upper, de, ee):
-    """Clip the controls and let the states follow."""
+def clip(u, ee, lower, upper):
+    """Clip a step of the controls to bounds (K, m)."""
+    for k in range(ee.shape[0]):
+        for i in range(ee.shape[1]):
+            ee[k, i] = min(max(u[k, i] + ee[k, i], lower[k, i]), upper[k, i]) - u[k, i]
+
+
+@numba.njit(error_model="numpy")
+def respond(A, B, f, de, ee):
+    """Let the states follow the controls."""
     K, n = de.shape
     for k in range(K):
-        for i in range(ee.shape[1]):
-            ee[k, i] = min(max(u[k, i] + ee[k, i], lower[i]), upper[i]) - u[k, i]
         for i in range(n):
             value = f[k, i]
             if k > 0:
@@ -125,17 +131,15 @@ def respond(A, B, f, u, lower, upper, de, ee):
 
 
 @numba.njit(error_model="numpy")
-def model_cost(dt, weight, at, lower, upper, Q, q, Rk, r, S, de, ee):
-    """Clip the step; cost by the model there, ∫‖Δu‖² dt and ∫‖Δx‖² dt."""
-    c, C, u, values = at[7], at[8], at[15], at[19]
+def model_cost(dt, weight, at, Q, q, Rk, r, S, de, ee):
+    """Cost by the model after a step, ∫‖Δu‖² dt and ∫‖Δx‖² dt."""
+    c, C, values = at[7], at[8], at[19]
     K, n = q.shape
     m, p = r.shape[1], c.shape[1]
     cost, step, radius = values[0] + values[2] + values[3], 0.0, 0.0
     for k in range(K):
         for i in range(m):
-            ee[k, i] = min(max(u[k, i] + ee[k, i], lower[i]), upper[i]) - u[k, i]
             step += dt[k] * ee[k, i] * ee[k, i]
-        for i in range(m):
             inner = r[k, i]
             for j in range(m):
                 inner += 0.5 * Rk[k, i, j] * ee[k, j]

@@ -94,7 +94,7 @@ def test_a_plateau_that_ends_in_a_fall(top, steep):
     found = search(lambda price: top / (1.0 + (top / 0.01 - 1.0) * (price / 3000.0) ** steep))
     assert found.reached
     assert 3000.0 <= found.price <= 3000.0 * 1.2
-    assert 0.5 * 0.01 <= found.rate
+    assert found.rate >= 0.5 * 0.01
 
 
 def test_a_floor_above_the_target_is_not_reached():
@@ -155,7 +155,7 @@ def test_a_failure_within_the_bracket_is_passed():
 
 def test_prices_that_fail_within_the_bracket_are_left_alone():
     def solve(price, warm):
-        return None if 120.0 < price < 160.0 else price
+        return None if 80.0 < price < 160.0 else price
 
     found = search(power(300.0, 3.0), solve=solve)
     failures = [trial for trial in found.tried if trial.answer is None]
@@ -174,10 +174,11 @@ def test_a_planner_that_always_fails():
 
 
 def test_a_jump_over_the_window_takes_the_safe_side():
-    found = search(lambda price: 0.012 if price < 33.0 else 0.006)
+    found = search(lambda price: 0.012 if price < 33.0 else 0.006, evaluations=40)
     assert found.reached
     assert found.rate == 0.006
     assert 33.0 <= found.price <= 33.0 * 1.1  # no dearer than needed
+    assert len(found.tried) <= 12  # it ends, although no price is near enough
 
 
 @pytest.mark.parametrize("target", [0.0094, 0.0018])
@@ -214,7 +215,7 @@ def test_noise_that_breaks_monotonicity_does_no_harm():
 
 def test_few_paths_leave_whole_counts_and_the_last_within_the_target_will_do():
     # 3.6 of 2000 paths are allowed: three is the nearest there is, though 17 % below.
-    uniforms = np.sort(np.random.default_rng(2).random(2000))
+    uniforms = (np.arange(2000) + 0.5) / 2000
     rate = interpolated(OPEN_LOOP)
     found = search(
         lambda price: np.searchsorted(uniforms, rate(price)) / 2000, 0.0018, resolution=1 / 2000

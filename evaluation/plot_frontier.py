@@ -1,0 +1,159 @@
+"""The figure of a frontier: effort and total cost against collision rate, curves named directly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from slipcar.evaluation import rows
+from slipcar.evaluation.frontier import CURVES, FEEDBACK, OPEN_LOOP, RECEDING
+from slipcar.evaluation.plot_labels import Label, place
+from slipcar.evaluation.plot_scene import INK, PALETTE, PAPER, new_figure, save_figure, style
+from slipcar.evaluation.statistics import CONFIDENCE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from slipcar.evaluation.frontier import Frontier, Point
+    from slipcar.evaluation.metrics import Result
+
+__all__ = ["frontier_figure", "save_figure"]
+
+_COLOURS = {OPEN_LOOP: PALETTE[0], FEEDBACK: PALETTE[1], RECEDING: PALETTE[2]}
+_CURVE_MARKERS = {OPEN_LOOP: "o", FEEDBACK: "s", RECEDING: "D"}
+_SINGLE_MARKERS = {rows.DETERMINISTIC: "^", rows.STOCHASTIC: "v", rows.FEEDBACK: "P", rows.PPO: "*"}
+_SINGLE_COLOURS = {rows.PPO: PALETTE[6]}
+_SIZES = {"*": 9.0, "P": 7.0, "^": 6.0, "v": 6.0}
+#: Shorter names, for labels in the picture.
+_SHORT = {rows.FEEDBACK: "stochastic SCP\n+ LQR feedback"}
+
+
+def frontier_figure(frontier: Frontier) -> Figure:
+    """Effort, and total cost, against collision rate, with 95 % intervals of all.
+
+    Filled markers are closed loop, hollow ones open loop; a rate of which nothing was observed is
+    an arrow at its upper limit. Small numbers are prices of risk.
+    """
+    results = frontier.comparison.results
+    shown = [(point, results[point.name]) for point in frontier.points if point.name in results]
+    with style():
+        figure = new_figure(9.6, 4.9)
+        left, right = figure.subplots(1, 2, sharex=True)
+        left.set_ylabel("mean effort")
+        right.set_ylabel("mean total cost: effort + obstacles + goal")
+        panels = [(left, "effort"), (right, "total")]
+        for axes, cost in panels:
+            for point, result in shown:
+                _draw_point(axes, point, result, cost)
+            axes.set_xscale("log")
+            axes.margins(x=0.1, y=0.1)
+            _percent_ticks(axes)
+            axes.set_xlabel(f"collision rate [%], {CONFIDENCE:.0%} interval")
+        figure.supxlabel(
+            "filled: closed loop; hollow: open loop; small numbers: price of risk ν; "
+            f"vertical bars: {CONFIDENCE:.0%} of the mean",
+            fontsize=8.0,
+            color=INK,
+        )
+        for axes, cost in panels:
+            lines = _draw_curves(axes, shown, cost) + _bars(shown, cost)
+            at = np.array([_place_of(result, cost) for _, result in shown]).reshape(-1, 2)
+            place(axes, _labels(shown, cost), at, lines)
+    return figure
+
+
+def _colour(point: Point) -> str:
+    return _COLOURS.get(point.method) or _SINGLE_COLOURS.get(point.name, INK)
+
+
+def _place_of(result: Result, cost: str) -> tuple[float, float]:
+    """Where a point is drawn: rate [%], or its upper limit where none was observed, and cost."""
+    rate = result.collision_rate or result.collision_interval[1]
+    return 100.0 * rate, getattr(result, cost)
+
+
+def _bars(shown: list[tuple[Point, Result]], cost: str) -> list[np.ndarray]:
+    """The intervals of the rates, as lines that names should not cover."""
+    return [
+        np.column_stack([100.0 * np.array(result.collision_interval), np.full(2, mean)])
+        for _, result in shown
+        for mean in (getattr(result, cost),)
+        if result.collision_rate > 0.0
+    ]
+
+
+def _draw_point(axes: Axes, point: Point, result: Result, cost: str) -> None:
+    colour = _colour(point)
+    marker = _CURVE_MARKERS.get(point.method) or _SINGLE_MARKERS.get(point.name, "X")
+    at, mean = _place_of(result, cost)
+    low, high = (100.0 * end for end in result.collision_interval)
+    seen = result.collision_rate > 0.0
+    error = float(1.96 * np.nan_to_num(getattr(result, f"{cost}_se")))
+    axes.errorbar(
+        at,
+        mean,
+        # Nothing observed: the rate lies somewhere below, which an arrow to the left says.
+        xerr=[[max(at - low, 0.0)], [max(high - at, 0.0)]] if seen else [[0.4 * at], [0.0]],
+        yerr=error,
+        xuplims=not seen,
+        color=colour,
+        fmt="none",
+        elinewidth=0.8,
+        capsize=0.0 if seen else 2.5,
+        alpha=0.75,
+        zorder=3,
+    )
+    axes.plot(
+        at,
+        mean,
+        marker=marker,
+        color=colour,
+        markerfacecolor=colour if result.closed_loop else PAPER,
+        markeredgewidth=1.2,
+        markersize=_SIZES.get(marker, 4.5),
+        linestyle="none",
+        zorder=5,
+    )
+
+
+def _draw_curves(axes: Axes, shown: list[tuple[Point, Result]], cost: str) -> list[np.ndarray]:
+    """Join the points of a method, in the order of their prices, as far as rates were observed."""
+    lines = []
+    for method in CURVES:
+        curve = [r for p, r in shown if p.method == method and r.collision_rate > 0.0]
+        line = np.array([_place_of(result, cost) for result in curve]).reshape(-1, 2)
+        axes.plot(*line.T, color=_COLOURS[method], linewidth=1.2, alpha=0.8, zorder=4)
+        lines.append(line)
+    return lines
+
+
+def _labels(shown: list[tuple[Point, Result]], cost: str) -> list[Label]:
+    """Names of curves and single points, then prices where there is room."""
+    labels = []
+    for method in CURVES:
+        curve = [_place_of(result, cost) for point, result in shown if point.method == method]
+        if curve:
+            look: dict[str, Any] = {"fontsize": 9.0, "fontweight": "bold"}
+            labels.append(Label(method, np.array(curve), _COLOURS[method], look=look))
+    for point, result in shown:
+        if point.method not in CURVES:
+            name = _SHORT.get(point.name, point.name)
+            at = np.array([_place_of(result, cost)])
+            labels.append(Label(name, at, _colour(point), look={"fontsize": 8.0}))
+    for point, result in shown:
+        if point.method in CURVES:
+            at = np.array([_place_of(result, cost)])
+            look = {"fontsize": 7.0}
+            text = f"{point.price:g}"
+            labels.append(Label(text, at, _colour(point), optional=True, look=look))
+    return labels
+
+
+def _percent_ticks(axes: Axes) -> None:
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,)))
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())

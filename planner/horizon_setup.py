@@ -1,0 +1,117 @@
+"""What a receding horizon is made of: what it charges, how far it replans, with which functions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner.expected.guarded import posed
+from slipcar.planner.expected.loop import Steered
+from slipcar.planner.expected.stakes import Stakes
+from slipcar.planner.horizon_batch import Replanner
+from slipcar.planner.method import compiled_functions, driver
+from slipcar.planner.moments import trace_integral
+from slipcar.planner.multipliers import Multipliers
+from slipcar.planner.newton.functions import Functions
+from slipcar.planner.options import Options
+from slipcar.planner.plan import Plan
+from slipcar.planner.problem import Model
+
+Array = np.ndarray
+
+#: Where the problem has no `terminal_weight`, feedback is charged so much for what it leaves of
+#: the terminal condition; as `Feedback`'s Qf.
+TERMINAL_WEIGHT = 100.0
+
+
+def stakes_of(problem: Any, risk_price: float, saturation: float) -> Stakes:
+    """What every replan is charged."""
+    guarded = posed(problem).guarded
+    priced = guarded.is_constraint
+    if risk_price > 0.0 and not priced.any():
+        raise ValueError(
+            f"risk_price={risk_price:g} needs a problem with constraint(t, x) -> (..., p), "
+            f"violated where > 0, which {type(problem).__name__} has not"
+        )
+    q = np.shape(problem.terminal(np.asarray(problem.start, dtype=np.float64)))[-1]
+    weight = getattr(problem, "terminal_weight", None)
+    soft = weight is not None
+    W = np.asarray(weight if soft else np.full(q, TERMINAL_WEIGHT), dtype=np.float64)
+    if W.shape != (q,) or not np.isfinite(W).all() or (W < 0.0).any():
+        raise ValueError(f"terminal_weight must be ({q},) finite numbers >= 0, not {weight!r}")
+    return Stakes(
+        weight=np.where(priced, risk_price, guarded.penalty_weight),
+        tail=priced,
+        terminal=W,
+        soft=soft,
+        feedback=True,
+        variance_weight=0.0,
+        saturation=saturation,
+    )
+
+
+def handover_of(model: Model, stakes: Stakes, given: Any) -> int:
+    """How many intervals at least a replan has."""
+    K, m, q = len(model.dt), model.control_dim, len(stakes.terminal)
+    least = 0 if stakes.soft else math.ceil(q / m)
+    if least > K:
+        raise ValueError(
+            f"a horizon of N - 1 = {K} intervals is too short for q = {q} terminal conditions "
+            f"with m = {m} controls: it takes at least {least}"
+        )
+    if given is None:
+        return 0 if stakes.soft else min(2 * least + 2, K)
+    whole = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
+    if not whole or not least <= given <= K:
+        raise ValueError(f"handover must be None or an integer in [{least}, {K}], not {given!r}")
+    return int(given)
+
+
+def replanner(
+    problem: Any,
+    stakes: Stakes,
+    iterations: int,
+    tolerance: float,
+    workers: int,
+    compiled: bool | None,
+    *,
+    guess: tuple[Array, Array],
+) -> Replanner:
+    """With compiled functions where they can be had."""
+    found = posed(problem)
+    run: ModuleType | None = None
+    functions: Functions | None = None
+    if compiled is not False and driver() is not None:
+        functions = found.functions(*guess, native=True)
+        if functions.kernels is None:
+            compiled_functions(found.model, Options(compiled=compiled), *guess)  # raises if asked
+            functions = None
+        else:
+            from slipcar.planner.expected import run as run
+    if functions is None:
+        functions = found.functions(*guess, native=False)
+    return Replanner(found.model, functions, stakes, iterations, tolerance, workers, run)
+
+
+def as_plan(first: Plan, found: Steered, model: Model, seconds: float) -> Plan:
+    """The plan that the expected cost makes of a plan of the mean."""
+    c = np.maximum(found.c[:, : len(model.weight)], 0.0)
+    return first.replace(
+        status=found.status,
+        mean=found.x,
+        controls=found.u,
+        covariance=found.covariance,
+        effort=found.effort,
+        obstacle_cost=float(np.vdot(model.dt[:, None] * model.weight, c * c)),
+        running_cost=found.running,
+        variance=trace_integral(found.covariance, model.dt),
+        iterations=first.iterations + found.iterations,
+        multipliers=Multipliers.of(found.adjoint, found.terminal, 0.0, found.A),
+        A=found.A,
+        B=found.B,
+        gains=found.gains,
+        solve_time=seconds,
+        message="",
+    )
