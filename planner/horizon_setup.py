@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,9 @@ def replanner(
             compiled_functions(found.model, Options(compiled=compiled), *guess)  # raises if asked
             functions = None
         else:
-            from slipcar.planner.expected import run as run
+            from slipcar.planner.expected import run as fast
+
+            run = fast
     if functions is None:
         functions = found.functions(*guess, native=False)
     return Replanner(found.model, functions, stakes, iterations, tolerance, workers, run)

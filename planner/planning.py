@@ -92,9 +92,10 @@ def plan(
         compiled: run Newton's method compiled by numba, the same steps to rounding errors. None:
             where numba is installed and the problem's functions can be traced, and no callback
             is to be called on the way.
-        starts: guesses to try, ≥ 1; None is 1, or 6 for expected costs: the problem's own (with and without its penalties at first) and
+        starts: guesses to try, ≥ 1: the problem's own (with and without its penalties at first) and
             others round the obstacles; the best plan is returned and `alternatives` says what
-            became of each.
+            became of each. None is 1, or 6 for an expected cost: the way round the obstacles that
+            is cheapest for the mean may be the riskiest.
         guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
             and controls (N−1, m); None takes the problem's own.
         cold_start: when the problem's own guess is tried beside `guess` and the better plan
@@ -126,8 +127,8 @@ def plan(
             `Feedback(plan)` plays it.
         expected: charge the penalties' expectation, E Σ w max(0, c)² for Gaussian states, instead
             of their value at the mean. With `risk`, `risk_price` and `feedback` it always is.
-        terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0. None:
-            exact, or with `feedback` the problem's `terminal_weight`, if it has one.
+        terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0.
+            None: exact, or with `feedback` the problem's `terminal_weight`, if it has one.
         check_derivatives: compare every Jacobian with differences before planning.
         callback: called with each :class:`Iteration`, from whichever guess and at whichever
             horizon; returning True stops that guess (all others begin nonetheless) and any search

@@ -168,7 +168,7 @@ def _predicted(model: Model, stakes: Stakes, trial: Any) -> float | None:
 
 
 def law(model: Model, found: Steered) -> Any:
-    """u = ū + K (x − μ) within bounds, as a function (t, x (..., n)) -> (..., m)."""
+    """The law u = ū + K (x − μ) within bounds, as a function (t, x (..., n)) -> (..., m)."""
     angles = tuple(getattr(model.problem, "angles", ()))
     closed = bool(found.gains.any())
     starts = model.times[:-1]
@@ -255,6 +255,7 @@ def _calibrated(
             break
         # Fresh paths disagree with those of the search: ask for less.
         target, first = target * 0.9 * delta / verified, search.price
+    assert found is not None
     return answer(found, search.price, bool(search.reached and verified <= delta))
 
 

@@ -25,7 +25,7 @@ _ROOT_HALF = math.sqrt(0.5)
 
 @numba.njit(error_model="numpy")
 def row_loss(c, s, tail):
-    """Value, slope, curvature and derivative by variance of one row of weight one: `losses.loss`."""
+    """`losses.loss` of one row of weight one: value, slope, curvature, derivative by variance."""
     t = c / s
     if tail:
         if t <= EDGE:

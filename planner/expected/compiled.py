@@ -68,7 +68,8 @@ def _iterate(
     low, high = np.zeros((K, m), dtype=np.bool_), np.zeros((K, m), dtype=np.bool_)
     low_new, high_new = low.copy(), high.copy()
     low_bound, high_bound = np.empty((K, m)), np.empty((K, m))
-    closed, P, vg, vh = np.empty((K, n, n)), np.empty((K, n, n)), np.empty((K, n)), np.empty((K, n, n))
+    closed, P = np.empty((K, n, n)), np.empty((K, n, n))
+    vg, vh = np.empty((K, n)), np.empty((K, n, n))
     slope, curvature = np.empty((K, p)), np.empty((K, p))
     no_G, no_g = np.zeros((q_, n)), np.zeros(q_)
     unit = 0.0  # of a shift

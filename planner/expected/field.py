@@ -16,8 +16,8 @@ import numpy as np
 from slipcar.planner.expected import loop
 from slipcar.planner.expected.belief import feedback_effort, loss_at
 from slipcar.planner.expected.guarded import Posed
-from slipcar.planner.expected.losses import loss
 from slipcar.planner.expected.loop import Steered
+from slipcar.planner.expected.losses import loss
 from slipcar.planner.expected.stakes import Stakes
 from slipcar.planner.method import driver
 from slipcar.planner.moments import trace_integral

@@ -133,7 +133,7 @@ def congruence(A, P, PA, out):
 
 @numba.njit(error_model="numpy")
 def noise_cost(w, P, sigma, d_sigma, dt, gradient, hessian):
-    """w Σ dt tr(P σσᵀ), and its gradient and Hessian by the states, σ linearised."""
+    """The cost w Σ dt tr(P σσᵀ), and its gradient and Hessian by the states, σ linearised."""
     K, n, d = sigma.shape
     value = 0.0
     weighted = np.empty((n, d))
