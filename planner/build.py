@@ -30,7 +30,7 @@ def build_steered(
 ) -> Plan:
     """A plan of an expected cost, which started from the plan of the mean `nominal`."""
     found = steered.found
-    penalties = found.c[:, : len(model.weight)]
+    penalties = model.penalty(model.times[1:], found.x[1:])
     outcome = dataclasses.replace(
         nominal,
         status=steered.status,

@@ -19,6 +19,7 @@ from slipcar.planner.newton.iterate_arrays import (
     noise_cost,
     semidefinite,
 )
+from slipcar.planner.newton.native import call
 
 _ROOT_HALF = math.sqrt(0.5)
 
@@ -51,14 +52,45 @@ def row_weight(weight, tail, dt, o, k):
 
 
 @numba.njit(error_model="numpy")
-def fill_losses(dt, weight, tail, c, s, slope, curvature):
+def row_hessians(addresses, parameters, times, x, chosen, bend):
+    """∂²c/∂x² of the chosen rows, (p, K, n, n); others stay as they are."""
+    p, K = bend.shape[:2]
+    for o in range(p):
+        if chosen[o]:
+            only = np.zeros((K, p))
+            only[:, o] = 1.0
+            call(
+                addresses[4],
+                (
+                    K, times[1:].ctypes.data, x[1:].ctypes.data, only.ctypes.data,
+                    parameters.ctypes.data, bend[o].ctypes.data,
+                ),
+            )  # fmt: skip
+
+
+@numba.njit(error_model="numpy")
+def expectations(bend, Sigma, chosen, offset):
+    """½ tr(∂²c Σ) of the chosen rows."""
+    p, K, n = bend.shape[:3]
+    for o in range(p):
+        if chosen[o]:
+            for k in range(K):
+                value = 0.0
+                for i in range(n):
+                    for j in range(n):
+                        value += bend[o, k, i, j] * Sigma[k + 1, i, j]
+                offset[k, o] = 0.5 * value
+
+
+@numba.njit(error_model="numpy")
+def fill_losses(dt, weight, tail, c, offset, s, slope, curvature):
     """Slopes and curvatures of all rows."""
     for k in range(c.shape[0]):
         for o in range(c.shape[1]):
             slope[k, o] = curvature[k, o] = 0.0
             w = row_weight(weight, tail, dt, o, k)
             if w > 0.0:
-                _, first, second, _ = row_loss(c[k, o], s[k, o], tail[o])
+                _, first, second, _ = row_loss(c[k, o] + offset[k, o], s[k, o], tail[o])
                 slope[k, o], curvature[k, o] = w * first, w * second
 
 
@@ -130,8 +162,8 @@ def optimal_gain(A, B, P, R, dt, gain):
 
 @numba.njit(error_model="numpy")
 def propagate(
-    at, dt, R, weight, tail, W, feedback, w, saturation, damping, fresh, lower, upper,
-    gains, held, closed, Sigma, s, P, vg, vh, low_bound, high_bound,
+    addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation, damping, fresh, lower, upper,
+    gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound, high_bound,
 ):  # fmt: skip
     """`belief.propagate`; writes from `gains` on. `fresh`: there are no weights to start from."""
     A, B, sigma, d_sigma, C, c, Hxx, G = at[1], at[2], at[3], at[4], at[8], at[7], at[11], at[13]
@@ -140,13 +172,16 @@ def propagate(
     close_loop(A, B, gains, closed)
     covariance(closed, sigma, dt, Sigma)
     deviations(C, Sigma, s)
+    charged = weight > 0.0
+    row_hessians(addresses, parameters, times, at[14], charged, bend)
+    expectations(bend, Sigma, charged, offset)
     largest = 0.0
     wanted = np.zeros((K, p))
     for k in range(K):
         for o in range(p):
             scale = row_weight(weight, tail, dt, o, k)
             if scale > 0.0:
-                wanted[k, o] = scale * row_loss(c[k, o], s[k, o], tail[o])[3]
+                wanted[k, o] = scale * row_loss(c[k, o] + offset[k, o], s[k, o], tail[o])[3]
                 largest = max(largest, wanted[k, o])
     least = 1e-9 * largest + 1e-30
     for k in range(K):
@@ -214,6 +249,7 @@ def propagate(
     if feedback:
         covariance(closed, sigma, dt, Sigma)
         deviations(C, Sigma, s)
+        expectations(bend, Sigma, charged, offset)
     noise_cost(1.0, P, sigma, d_sigma, dt, vg, vh)
     for k in range(K):
         for i in range(m):
@@ -227,7 +263,7 @@ def propagate(
 
 
 @numba.njit(error_model="numpy")
-def cost(at, dt, weight, tail, W, soft, s, P):
+def cost(at, dt, weight, tail, W, soft, offset, s, P):
     """Expected cost, P and s held: `loop._cost`."""
     sigma, c, g, values = at[3], at[7], at[12], at[19]
     K, n, d = sigma.shape
@@ -236,7 +272,7 @@ def cost(at, dt, weight, tail, W, soft, s, P):
         for o in range(c.shape[1]):
             scale = row_weight(weight, tail, dt, o, k)
             if scale > 0.0:
-                total += scale * row_loss(c[k, o], s[k, o], tail[o])[0]
+                total += scale * row_loss(c[k, o] + offset[k, o], s[k, o], tail[o])[0]
         for a in range(d):
             for i in range(n):
                 b = sigma[k, i, a]

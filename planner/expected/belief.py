@@ -8,9 +8,11 @@ With rows' derivatives by variance η and J the quadratic in deviations that fol
     K_k = −(dt R + BᵀP_{k+1}B)⁻¹ BᵀP_{k+1}A            (K = 0 in open loop)
 
 the expected cost is that of the mean plus Σ_k dt tr(P_{k+1} σ_k σ_kᵀ), and P is its derivative by
-the noise that arrives at a node. Held while a step is computed, P makes the noise a cost of the
-deterministic states σ depends on: the sensitivity of every later Σ is in it. What P neglects,
-that η and K would follow, is of second order at a solution: K is optimal there.
+the noise that arrives at a node. Rows are Gaussian with the expectation c(μ) + ½ tr(∂²c Σ) and
+the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more distance than its mean does. Held while a step is computed, P makes the noise a cost of the
+deterministic states σ depends on: the sensitivity of every later Σ is in it. That η and K would
+follow is of second order at a solution, where K is optimal. What is neglected is how ∂b/∂x, C and
+½ tr(∂²c Σ) follow.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from slipcar.planner import moments
 from slipcar.planner.convexify import nearest_semidefinite
 from slipcar.planner.expected.losses import Loss, deviations, loss
 from slipcar.planner.expected.stakes import Stakes
+from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.model import Iterate
 from slipcar.planner.problem import Model
 
@@ -37,6 +40,7 @@ class Belief:
         covariance: Σ, (N, n, n).
         gains: K, (K, m, n); zeros in open loop.
         held: rows' derivatives by variance that P was computed with, (K, p).
+        offset: ½ tr(∂²c Σ), what rows' expectations have beyond their values at the mean, (K, p).
         s: rows' standard deviations, (K, p).
         P: at nodes 1..K, (K, n, n).
         noise: Σ dt tr(P σσᵀ) as a quadratic in the states.
@@ -47,6 +51,7 @@ class Belief:
     covariance: Array
     gains: Array
     held: Array
+    offset: Array
     s: Array
     P: Array
     noise: moments.Variance
@@ -60,12 +65,18 @@ def row_weight(model: Model, stakes: Stakes) -> Array:
 
 
 def loss_at(model: Model, stakes: Stakes, c: Array, s: Array) -> Loss:
-    """Losses of all rows at nodes 1..K."""
+    """Losses of all rows at nodes 1..K, from their expectations and deviations."""
     return loss(c, s, row_weight(model, stakes), stakes.tail)
 
 
 def propagate(
-    model: Model, at: Iterate, stakes: Stakes, gains: Array, held: Array | None, damping: float
+    model: Model,
+    functions: Functions,
+    at: Iterate,
+    stakes: Stakes,
+    gains: Array,
+    held: Array | None,
+    damping: float,
 ) -> Belief:
     """What follows at an iterate from the gains (K, m, n) and row weights (K, p) before.
 
@@ -74,8 +85,9 @@ def propagate(
     """
     lin = at.lin
     S = _covariance(model, at, gains)
-    s = deviations(lin.C, S[1:])
-    wanted = loss_at(model, stakes, lin.c, s).by_variance
+    bend = _row_hessians(model, functions, at)
+    offset, s = _expectations(bend, S), deviations(lin.C, S[1:])
+    wanted = loss_at(model, stakes, lin.c + offset, s).by_variance
     if held is None or damping == 1.0:
         held = wanted
     else:
@@ -85,17 +97,34 @@ def propagate(
     P, gains = _weights(model, at, stakes, held)
     if stakes.feedback:
         S = _covariance(model, at, gains)
-        s = deviations(lin.C, S[1:])
+        offset, s = _expectations(bend, S), deviations(lin.C, S[1:])
     noise = moments.variance_penalty(1.0, lin.sigma, at.d_sigma, P, model.dt)
     spread = np.sqrt(np.maximum(np.einsum("kmi,kij,kmj->km", gains, S[:-1], gains), 0.0))
     room = 0.45 * (model.upper - model.lower)
     margin = np.minimum(stakes.saturation * spread, room)
-    return Belief(S, gains, held, s, P, noise, model.lower + margin, model.upper - margin)
+    return Belief(S, gains, held, offset, s, P, noise, model.lower + margin, model.upper - margin)
 
 
 def feedback_effort(model: Model, gains: Array, S: Array) -> float:
     """Σ dt tr(K Σ Kᵀ R)."""
     return float(np.einsum("k,kmi,kij,klj,lm", model.dt, gains, S[:-1], gains, model.R))
+
+
+def _row_hessians(model: Model, functions: Functions, at: Iterate) -> Array:
+    """∂²c/∂x² of every row at nodes 1..K, (p, K, n, n)."""
+    (K, p), n = at.lin.c.shape, at.lin.x.shape[1]
+    bend = np.zeros((p, K, n, n))
+    for o in range(p):
+        only = np.zeros((K, p))
+        only[:, o] = 1.0
+        found = functions.node_hessian(t=model.times[1:], x=at.lin.x[1:], weight=only)
+        bend[o] = found["xx"].reshape(K, n, n)
+    return bend
+
+
+def _expectations(bend: Array, S: Array) -> Array:
+    """½ tr(∂²c Σ) from Hessians (p, K, n, n) and Σ (N, n, n): (K, p)."""
+    return 0.5 * np.einsum("pkij,kij->kp", bend, S[1:])
 
 
 def _covariance(model: Model, at: Iterate, gains: Array) -> Array:

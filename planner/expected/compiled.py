@@ -15,11 +15,13 @@ import numpy as np
 
 from slipcar.planner.expected.arrays import (
     cost,
+    expectations,
     fill_losses,
     model_change,
     priced,
     propagate,
     quadratic,
+    row_hessians,
 )
 from slipcar.planner.newton import compiled as newton
 from slipcar.planner.newton.caching import stamp
@@ -71,6 +73,7 @@ def _iterate(
     closed, P = np.empty((K, n, n)), np.empty((K, n, n))
     vg, vh = np.empty((K, n)), np.empty((K, n, n))
     slope, curvature = np.empty((K, p)), np.empty((K, p))
+    bend, offset = np.zeros((p, K, n, n)), np.zeros((K, p))
     no_G, no_g = np.zeros((q_, n)), np.zeros(q_)
     unit = 0.0  # of a shift
     for i in range(m):
@@ -79,8 +82,8 @@ def _iterate(
     if not warm:
         gains[:], held[:], adjoint[:], nu[:] = 0.0, 0.0, 0.0, 0.0
     propagate(
-        at, dt, R, weight, tail, W, feedback, w, saturation, damping, not warm, lower, upper,
-        gains, held, closed, Sigma, s, P, vg, vh, low_bound, high_bound,
+        addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation, damping, not warm, lower, upper,
+        gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound, high_bound,
     )  # fmt: skip
     # Where the end is charged its condition is left out: a system so soft has the multiplier 0.
     kappa, seen = 0.0, 1.0 / SOFTNESS
@@ -94,7 +97,7 @@ def _iterate(
     for _ in range(max_iterations):
         A, B, f, xs, us = at[1], at[2], at[16], at[14], at[15]
         G, g = (no_G, no_g) if soft else (at[13], at[12])
-        fill_losses(dt, weight, tail, at[7], s, slope, curvature)
+        fill_losses(dt, weight, tail, at[7], offset, s, slope, curvature)
         quadratic(
             addresses, parameters, times, dt, R, at, slope, curvature, W, soft, adjoint, nu, vg,
             vh, Q, q, Rk, r, S,
@@ -135,7 +138,7 @@ def _iterate(
             respond(A, B, f, de, ee)
         change, step, length, radius = model_change(dt, R, Q, q, Rk, r, S, de, ee)
         price, dear = half_largest(next_adjoint), 0.0 if soft else half_largest(next_nu)
-        here = cost(at, dt, weight, tail, W, soft, s, P)
+        here = cost(at, dt, weight, tail, W, soft, offset, s, P)
         value, gap, miss = priced(at, next_adjoint, next_nu, soft)
         lacking = price * gap + dear * miss
         gained, factor = value - change, 1.0
@@ -157,7 +160,7 @@ def _iterate(
             actual = -np.inf
             if evaluate(addresses, parameters, times, dt, R, none, 0.0, new):
                 value, gap, miss = priced(new, next_adjoint, next_nu, soft)
-                merit = cost(new, dt, weight, tail, W, soft, s, P) + value
+                merit = cost(new, dt, weight, tail, W, soft, offset, s, P) + value
                 actual = before - merit - factor * (price * gap + dear * miss)
                 accepted = (predicted <= noise and actual >= -noise) or (
                     actual >= tuning.armijo * alpha * predicted
@@ -194,16 +197,22 @@ def _iterate(
             for j in range(q_):
                 nu[j] = 2.0 * W[j] * at[12][j]
         propagate(
-            at, dt, R, weight, tail, W, feedback, w, saturation, damping, False, lower, upper,
-            gains, held, closed, Sigma, s, P, vg, vh, low_bound, high_bound,
+            addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation, damping, False, lower, upper,
+            gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound, high_bound,
         )  # fmt: skip
         if alpha == 1.0 and step + last <= tolerance and _consistent(at, soft, tuning):
             status = CONVERGED
             break
         last = step
-    x[:], u[:], A_out[:], B_out[:], c_out[:] = at[14], at[15], at[1], at[2], at[7]
+    every = np.ones(p, dtype=np.bool_)
+    row_hessians(addresses, parameters, times, at[14], every, bend)
+    expectations(bend, Sigma, every, offset)
+    x[:], u[:], A_out[:], B_out[:] = at[14], at[15], at[1], at[2]
+    for k in range(K):
+        for o in range(p):
+            c_out[k, o] = at[7][k, o] + offset[k, o]
     values[0], values[1] = at[19][0], at[19][2]
-    values[2] = cost(at, dt, weight, tail, W, soft, s, P)
+    values[2] = cost(at, dt, weight, tail, W, soft, offset, s, P)
     return status, tried
 
 

@@ -41,7 +41,7 @@ class Steered:
         gains: (K, m, n); zeros in open loop.
         covariance: Σ, (N, n, n).
         held: rows' derivatives by variance, (K, p).
-        c: rows at nodes 1..K, (K, p).
+        c: rows' expectations at nodes 1..K, (K, p).
         s: their standard deviations, (K, p).
         A: (K, n, n).
         B: (K, n, m).
@@ -97,7 +97,7 @@ def iterate(
     gains, held = np.zeros((K, m, n)), None
     if warm is not None:
         adjoint, terminal, gains, held = warm.adjoint, warm.terminal, warm.gains, warm.held
-    belief = propagate(model, at, stakes, gains, held, damping if warm is not None else 1.0)
+    belief = propagate(model, functions, at, stakes, gains, held, damping if warm is not None else 1.0)
     unit = float(np.max(np.diag(model.R)))
     shift, last, rejected, tried = 0.0, np.inf, 0, 0
     solver = LqSolver(K, n, m, 0 if stakes.soft else q)
@@ -145,7 +145,7 @@ def iterate(
         shift = max(_next_shift(shift, unit, step, tuning), floor)
         at, adjoint = step.new, found.adjoint
         terminal = 2.0 * stakes.terminal * at.lin.g if stakes.soft else found.terminal
-        belief = propagate(model, at, stakes, belief.gains, belief.held, damping)
+        belief = propagate(model, functions, at, stakes, belief.gains, belief.held, damping)
         if step.alpha == 1.0 and length + last <= tolerance and _consistent(at, stakes, tuning):
             status = Status.CONVERGED
             break
@@ -154,7 +154,7 @@ def iterate(
     value = _cost(model, stakes, at, belief)
     return Steered(
         status=status, x=lin.x, u=lin.u, gains=belief.gains, covariance=belief.covariance,
-        held=belief.held, c=lin.c, s=belief.s, A=lin.A, B=lin.B, adjoint=adjoint,
+        held=belief.held, c=lin.c + belief.offset, s=belief.s, A=lin.A, B=lin.B, adjoint=adjoint,
         terminal=terminal, effort=lin.effort, running=lin.running,
         objective=value, iterations=tried,
     )  # fmt: skip
@@ -164,7 +164,7 @@ def _cost(model: Model, stakes: Stakes, at: Iterate, belief: Belief) -> float:
     """Expected cost, P and s held."""
     lin = at.lin
     value = lin.effort + lin.running
-    value += float(loss_at(model, stakes, lin.c, belief.s).value.sum())
+    value += float(loss_at(model, stakes, lin.c + belief.offset, belief.s).value.sum())
     weighed = (model.dt[:, None, None] * belief.P) @ lin.sigma
     value += float(np.vdot(weighed, lin.sigma))
     if stakes.soft:
@@ -186,7 +186,7 @@ def _quadratic(
     (K, m), n = lin.u.shape, lin.x.shape[1]
     assert lin.q_running is not None
     assert lin.r_running is not None
-    rows = loss_at(model, stakes, lin.c, belief.s)
+    rows = loss_at(model, stakes, lin.c + belief.offset, belief.s)
     q = lin.q_running + np.einsum("kpi,kp->ki", lin.C, rows.slope)
     Q = dt[:, None, None] * at.H_xx
     Q += np.einsum("kpi,kp,kpj->kij", lin.C, rows.curvature, lin.C, optimize=True)

@@ -47,7 +47,7 @@ class Batch:
         A: (P, K, n, n).
         B: (P, K, n, m).
         covariance: (P, N, n, n).
-        c: (P, K, p).
+        c: expectations, (P, K, p).
         s: (P, K, p).
         values: effort, running cost, objective, (P, 3).
         ended: how, and steps tried, (P, 2).
