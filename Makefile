@@ -29,7 +29,7 @@ CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
 
-.PHONY: help install compare test test-long train bench bench-worlds bench-docs lint types lock peers clean
+.PHONY: help install compare frontier test test-long train bench bench-worlds bench-docs lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -47,6 +47,9 @@ test: $(INSTALLED)  ## all tests but the long ones
 
 test-long: $(INSTALLED)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m long $(ARGS)
+
+frontier: $(INSTALLED)  ## what safety costs: effort against collision rate; results/frontier
+	$(BIN)/slipcar frontier $(ARGS)
 
 train: $(INSTALLED)  ## train the PPO baseline; runs/ppo
 	$(BIN)/slipcar train $(ARGS)
@@ -68,7 +71,7 @@ types: $(INSTALLED)  ## mypy over the installed package
 	$(BIN)/mypy
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
+compare frontier train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
 
 # Compiled once per machine, not once per renewed tree of links.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba

@@ -14,8 +14,8 @@ _COMPILED = {"auto": None, "yes": True, "no": False}
 def plan(
     *,
     scenario: ScenarioOption = "paper",
-    variance_weight: float = 1.0,
-    starts: int = 1,
+    variance_weight: float | None = None,
+    starts: int | None = None,
     guess: Path | None = None,
     method: Literal["auto", "newton", "convex"] = "auto",
     compiled: Literal["auto", "yes", "no"] = "auto",
@@ -30,6 +30,11 @@ def plan(
     trust_region: Literal["adaptive", "paper", "none"] | None = None,
     linearization: Literal["composite", "literal"] = "composite",
     terminal_tolerance: float = 0.0,
+    risk: float | None = None,
+    risk_price: float | None = None,
+    risk_episodes: int = 100_000,
+    feedback: bool = False,
+    expected: bool = False,
     save: Path | None = None,
     figure: Path | None = None,
     figures: Path | None = None,
@@ -38,24 +43,30 @@ def plan(
 ) -> int:
     """Plan a scenario by stochastic SCP; print each iteration, the plan and what it proves.
 
-    The certificate at the end checks the maximum principle of the non-linear problem. Ends with
-    exit code 1 if the plan did not converge.
+    With --risk, --risk-price, --feedback or --expected the plan minimises an expected cost: it
+    prints what is expected, and the risk that was asked for with the proof of it. Otherwise a
+    certificate checks the maximum principle of the non-linear problem. Ends with exit
+    code 1 if the plan did not converge or the risk cannot be kept.
 
         slipcar plan
         slipcar plan --tolerance 1e-10 --figures figures
         slipcar plan --scenario random:7 --starts 8 --save plan.npz
+        slipcar plan --risk 0.01
+        slipcar plan --feedback --risk 0.001 --figures figures --save plan.npz
         slipcar plan --free-final-time --time-weight 2
         slipcar plan --method convex --shooting --tolerance 1e-12
         slipcar plan --solver cvxpy --linearization literal --trust-region paper
         slipcar plan --compare-methods residuals.png
 
-    Calls slipcar.planner.plan, twice: the second is timed, when compiled code is in memory.
+    Calls slipcar.planner.plan, twice (but with --risk): the second is timed, when compiled code is
+    in memory.
 
     Args:
         scenario: which world.
         variance_weight: weight w of the integral of tr Sigma [1/(m2 s)]; 0 is deterministic SCP.
+            By default 1, or 0 for an expected cost, which counts the noise already.
         starts: guesses to try, the problem's own and others round the obstacles; the best plan
-            counts, a table tells what became of each.
+            counts, a table tells what became of each. By default 1, or 6 for an expected cost.
         guess: start from this plan (.npz), of any time grid; the problem's own guess is tried
             beside it unless this one fits and converges.
         method: newton: one LQ problem per iteration, quadratic at the end; convex: the paper's
@@ -77,10 +88,16 @@ def plan(
             at each iteration.
         linearization: of the obstacle cost; literal is as the paper prints it, and implies convex.
         terminal_tolerance: half-width of a box round the terminal condition; > 0 implies convex.
+        risk: the probability of any collision on the path must not exceed this, in (0, 1).
+        risk_price: add this cost per unit of collision probability, without Monte Carlo.
+        risk_episodes: fresh paths that verify the risk.
+        feedback: plan gains too, for the least expected cost.
+        expected: charge the obstacle cost's expectation, in open loop.
         save: write the plan to this .npz file (slipcar.planner.Plan.load reads it).
         figure: write the paper's Figure 1 of this plan, as .png, .pdf or .svg.
         figures: write to this folder, as .png and .pdf: Figure 1, the covariance against sample
-            paths, the Hamiltonian along the control with the multipliers.
+            paths and, unless the cost is an expected one, the Hamiltonian along the control with
+            the multipliers.
         compare_methods: write residual against iteration and time for the methods, on this
             scenario and faintly on random ones, as .png, .pdf or .svg.
         worlds: how many random ones, for --compare-methods.
@@ -115,16 +132,22 @@ def plan(
         "trust_region": trust_region,
         "linearization": linearization,
         "terminal_tolerance": terminal_tolerance,
+        "risk": risk,
+        "risk_price": risk_price,
+        "risk_episodes": risk_episodes,
+        "feedback": feedback,
+        "expected": expected,
     }
     first = make_plan(world, **options)
-    found = make_plan(world, **options)
+    found = first if risk is not None else make_plan(world, **options)
     if found.alternatives:
         out.print(text.alternatives_table(found))
     out.print(text.iterations_table(found))
     if found.time_search:
         out.print(text.horizons_table(found))
     out.print(text.summary(found, first.solve_time), markup=False)
-    out.print(f"\n{found.certificate}", markup=False)
+    if found.expected is None:
+        out.print(f"\n{found.certificate}", markup=False)
     if save is not None:
         save.parent.mkdir(parents=True, exist_ok=True)
         found.save(save)
@@ -143,10 +166,9 @@ def plan(
 
 def _draw(found: Any, path: Path) -> None:
     from slipcar.evaluation import plots, sample_paths
-    from slipcar.planner import OpenLoop
 
     # A free final time makes another scenario: the plan knows which.
-    states, _ = sample_paths(OpenLoop(found), found.problem, plots.SHOWN_PATHS)
+    states, _ = sample_paths(plots.played(found), found.problem, plots.SHOWN_PATHS)
     _write(plots.iterations_figure(found.problem, found, states), path)
 
 
@@ -155,6 +177,8 @@ def _draw_all(found: Any, folder: Path) -> list[Path]:
     from slipcar.evaluation.plots_certificate import plot_hamiltonian
 
     written = plots.save_plan_figures(found.problem, found, folder)
+    if found.expected is not None:
+        return written
     return written + plots.save_figure(plot_hamiltonian(found), folder, "hamiltonian")
 
 

@@ -30,6 +30,14 @@ def summary(found: Any, first_seconds: float) -> str:
         f"{found.obstacle_cost:.6f}, integral of tr Σ {found.variance:.6f} "
         f"(weight {found.options['variance_weight']:g})"
     )
+    if found.expected is not None:
+        lines.append(_expected(found.expected))
+    if found.risk is not None:
+        lines.append(str(found.risk))
+        lines.append(
+            f"{len(found.risk.tried)} prices tried, {found.risk.simulation_time:.2f} s of it Monte "
+            f"Carlo; planning alone {_milliseconds(found.solve_time - found.risk.simulation_time)} ms"
+        )
     if found.time_search:
         lines.append(
             f"final time {found.final_time:.6f} s, at {found.options['time_weight']:g} a second"
@@ -40,6 +48,16 @@ def summary(found: Any, first_seconds: float) -> str:
             f"{found.shot.iterations} Newton steps in {_milliseconds(found.shot.seconds)} ms"
         )
     return "\n".join(lines)
+
+
+def _expected(cost: Any) -> str:
+    """One line on an expected cost."""
+    goal = f", goal {cost.goal:.4f}" if cost.goal else ""
+    return (
+        f"expected: total {cost.total:.4f} = effort {cost.effort:.4f}, corrections "
+        f"{cost.feedback:.4f}, obstacle {cost.penalty:.4f}{goal}; collision at most "
+        f"{100.0 * cost.risk:.3f} % (Boole)"
+    )
 
 
 def iterations_table(found: Any) -> Table:

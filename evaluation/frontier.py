@@ -26,6 +26,7 @@ from slipcar.evaluation import rows
 from slipcar.evaluation.compare import Comparison, compare
 from slipcar.evaluation.rollout import Controller, check_counts
 from slipcar.planner import Feedback, OpenLoop, plan
+from slipcar.planner.receding_horizon import RecedingHorizon
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -146,8 +147,6 @@ def candidates(
     policy: Controller | None,
 ) -> tuple[list[Point], list[str]]:
     """The points, and what a reader must be told; plans that did not converge are left out."""
-    from slipcar.planner import RecedingHorizon
-
     scenario.action_scale  # noqa: B018  raises now if it is unbounded
     notes: list[str] = []
     plan(scenario)  # so that planning times are warm ones, without first-call costs

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from slipcar.evaluation.frontier import Frontier, Point
     from slipcar.evaluation.metrics import Result
 
-__all__ = ["frontier_figure", "save_figure"]
+    Shown = tuple[Point, Result]
+
+__all__ = ["frontier_figure", "save_figure", "widest_gap"]
 
 _COLOURS = {OPEN_LOOP: PALETTE[0], FEEDBACK: PALETTE[1], RECEDING: PALETTE[2]}
 _CURVE_MARKERS = {OPEN_LOOP: "o", FEEDBACK: "s", RECEDING: "D"}
@@ -29,40 +31,80 @@ _SINGLE_COLOURS = {rows.PPO: PALETTE[6]}
 _SIZES = {"*": 9.0, "P": 7.0, "^": 6.0, "v": 6.0}
 #: Shorter names, for labels in the picture.
 _SHORT = {rows.FEEDBACK: "stochastic SCP\n+ LQR feedback"}
+_COSTS = {"effort": "mean effort", "total": "mean total cost: effort + obstacles + goal"}
+_RATE = f"collision rate [%], {CONFIDENCE:.0%} interval"
+_READING = (
+    "filled: closed loop; hollow: open loop; small numbers: price of risk ν; "
+    f"vertical bars: {CONFIDENCE:.0%} interval of the mean"
+)
 
 
 def frontier_figure(frontier: Frontier) -> Figure:
     """Effort, and total cost, against collision rate, with 95 % intervals of all.
 
     Filled markers are closed loop, hollow ones open loop; a rate of which nothing was observed is
-    an arrow at its upper limit. Small numbers are prices of risk.
+    an arrow at its upper limit. Small numbers are prices of risk. Where nothing lies over much of
+    an axis of costs, it is broken.
     """
     results = frontier.comparison.results
     shown = [(point, results[point.name]) for point in frontier.points if point.name in results]
     with style():
-        figure = new_figure(9.6, 4.9)
-        left, right = figure.subplots(1, 2, sharex=True)
-        left.set_ylabel("mean effort")
-        right.set_ylabel("mean total cost: effort + obstacles + goal")
-        panels = [(left, "effort"), (right, "total")]
-        for axes, cost in panels:
-            for point, result in shown:
+        figure = new_figure(9.6, 5.2)
+        grid = figure.add_gridspec(2, 2)
+        panels = []
+        for column, (cost, label) in enumerate(_COSTS.items()):
+            panels += _panels(figure, grid[:, column], shown, cost, label)
+        # Limits of all axes first: names are placed by them.
+        for axes, cost, part in panels:
+            for point, result in part:
                 _draw_point(axes, point, result, cost)
             axes.set_xscale("log")
-            axes.margins(x=0.1, y=0.1)
+            axes.margins(x=0.1, y=0.12)
+        for axes, _, _ in panels[1:]:
+            axes.sharex(panels[0][0])
+        for axes, _, _ in panels:
+            axes.autoscale_view()
             _percent_ticks(axes)
-            axes.set_xlabel(f"collision rate [%], {CONFIDENCE:.0%} interval")
-        figure.supxlabel(
-            "filled: closed loop; hollow: open loop; small numbers: price of risk ν; "
-            f"vertical bars: {CONFIDENCE:.0%} of the mean",
-            fontsize=8.0,
-            color=INK,
-        )
-        for axes, cost in panels:
-            lines = _draw_curves(axes, shown, cost) + _bars(shown, cost)
-            at = np.array([_place_of(result, cost) for _, result in shown]).reshape(-1, 2)
-            place(axes, _labels(shown, cost), at, lines)
+        figure.supxlabel(_READING, fontsize=8.0, color=INK)
+        for axes, cost, part in panels:
+            lines = _draw_curves(axes, part, cost) + _bars(part, cost)
+            at = np.array([_place_of(result, cost) for _, result in part]).reshape(-1, 2)
+            place(axes, _labels(part, cost), at, lines)
     return figure
+
+
+def _panels(
+    figure: Figure, where: Any, shown: list[Shown], cost: str, label: str
+) -> list[tuple[Axes, str, list[Shown]]]:
+    """Axes for one cost, and what is drawn in each: one, or two where the axis is broken."""
+    gap = widest_gap([getattr(result, cost) for _, result in shown])
+    if gap is None:
+        axes = figure.add_subplot(where)
+        axes.set_ylabel(label)
+        axes.set_xlabel(_RATE)
+        return [(axes, cost, shown)]
+    parts = where.subgridspec(2, 1, hspace=0.08)
+    upper, lower = figure.add_subplot(parts[0]), figure.add_subplot(parts[1])
+    upper.spines["bottom"].set_visible(False)
+    upper.tick_params(axis="x", which="both", bottom=False, labelbottom=False)
+    lower.set_ylabel(label, y=1.05)
+    lower.set_xlabel(_RATE)
+    mark = {"marker": [(-1, -0.6), (1, 0.6)], "markersize": 8, "linestyle": "none", "color": INK}
+    upper.plot([0], [0], transform=upper.transAxes, clip_on=False, **mark)
+    lower.plot([0], [1], transform=lower.transAxes, clip_on=False, **mark)
+    high = [row for row in shown if getattr(row[1], cost) >= gap[1]]
+    low = [row for row in shown if getattr(row[1], cost) <= gap[0]]
+    return [(upper, cost, high), (lower, cost, low)]
+
+
+def widest_gap(values: list[float]) -> tuple[float, float] | None:
+    """Neighbours in size with nothing between over more than a third of the range, or None."""
+    ordered = np.sort(np.asarray(values, dtype=float))
+    if len(ordered) < 2:
+        return None
+    widest = int(np.argmax(np.diff(ordered)))
+    low, high = float(ordered[widest]), float(ordered[widest + 1])
+    return (low, high) if high - low > (ordered[-1] - ordered[0]) / 3.0 else None
 
 
 def _colour(point: Point) -> str:
@@ -75,7 +117,7 @@ def _place_of(result: Result, cost: str) -> tuple[float, float]:
     return 100.0 * rate, getattr(result, cost)
 
 
-def _bars(shown: list[tuple[Point, Result]], cost: str) -> list[np.ndarray]:
+def _bars(shown: list[Shown], cost: str) -> list[np.ndarray]:
     """The intervals of the rates, as lines that names should not cover."""
     return [
         np.column_stack([100.0 * np.array(result.collision_interval), np.full(2, mean)])
@@ -119,7 +161,7 @@ def _draw_point(axes: Axes, point: Point, result: Result, cost: str) -> None:
     )
 
 
-def _draw_curves(axes: Axes, shown: list[tuple[Point, Result]], cost: str) -> list[np.ndarray]:
+def _draw_curves(axes: Axes, shown: list[Shown], cost: str) -> list[np.ndarray]:
     """Join the points of a method, in the order of their prices, as far as rates were observed."""
     lines = []
     for method in CURVES:
@@ -130,19 +172,23 @@ def _draw_curves(axes: Axes, shown: list[tuple[Point, Result]], cost: str) -> li
     return lines
 
 
-def _labels(shown: list[tuple[Point, Result]], cost: str) -> list[Label]:
+def _labels(shown: list[Shown], cost: str) -> list[Label]:
     """Names of curves and single points, then prices where there is room."""
     labels = []
     for method in CURVES:
         curve = [_place_of(result, cost) for point, result in shown if point.method == method]
         if curve:
             look: dict[str, Any] = {"fontsize": 9.0, "fontweight": "bold"}
-            labels.append(Label(method, np.array(curve), _COLOURS[method], look=look))
+            # Highest price first: there the curves are furthest from each other.
+            labels.append(Label(method, np.array(curve[::-1]), _COLOURS[method], look=look))
+    named: list[tuple[np.ndarray, str, str]] = []
     for point, result in shown:
         if point.method not in CURVES:
-            name = _SHORT.get(point.name, point.name)
-            at = np.array([_place_of(result, cost)])
-            labels.append(Label(name, at, _colour(point), look={"fontsize": 8.0}))
+            name, at = _SHORT.get(point.name, point.name), np.array(_place_of(result, cost))
+            if named and named[-1][2] == _colour(point) and np.allclose(at, named[-1][0], 0.05):
+                name = f"{named.pop()[1]},\n{name}"  # one on top of the other: named together
+            named.append((at, name, _colour(point)))
+    labels += [Label(name, at[None], colour, look={"fontsize": 8.0}) for at, name, colour in named]
     for point, result in shown:
         if point.method in CURVES:
             at = np.array([_place_of(result, cost)])

@@ -31,9 +31,10 @@ class Label:
 
     Attributes:
         text: what to write.
-        anchors: (k, 2) in data coordinates; it is written beside whichever leaves most room.
+        anchors: (k, 2) in data coordinates; it is written beside whichever leaves most room, the
+            first if they are alike.
         colour: of the text.
-        optional: left out rather than written over something.
+        optional: left out rather than written over something or far away.
         look: further properties of the text.
     """
 
@@ -77,7 +78,7 @@ def place(
         anchors = axes.transData.transform(label.anchors)
         ground = _Ground(inside, taken, ink, pixels)
         index, _, box, distance = min(_candidates(anchors, extent, pixels), key=ground.badness)
-        if label.optional and ground.covers(box):
+        if label.optional and (distance > _LEADER or ground.covers(box)):
             text.remove()
             continue
         taken.append(box)
@@ -136,9 +137,11 @@ class _Ground(NamedTuple):
     def badness(self, place: Place) -> float:
         """How much a place is to be avoided: what it covers first, then how far away it is."""
         box = place.box
+        # Of a curve's anchors the first are preferred: its end.
         covered = sum(_overlap(box.padded(1.5 * self.pixels), other) for other in self.taken)
         crossed = _within(box.padded(2.0 * self.pixels), self.ink)
         cost = 20.0 * covered / self.pixels**2 + 30.0 * crossed + place.distance
+        cost += 3.0 * place.index
         if place.distance > _LEADER:
             end = np.clip(place.anchor, box.p0, box.p1)
             way = _sampled(np.array([end, place.anchor]))

@@ -34,6 +34,9 @@ _MEASURED: dict[str, Any] = {"color": PALETTE[1], "linestyle": (0, (4, 3)), "lin
 def iterations_figure(scenario: Scenario, plan: Any, states: np.ndarray) -> Figure:
     """The paper's Figure 1: every accepted iterate, and sample paths of the plan they lead to.
 
+    The iterates of a plan of an expected cost are those of the plan of the mean that it started
+    from, and then the plan itself.
+
     Args:
         scenario: the world.
         plan: a `slipcar.planner.Plan` with its history.
@@ -42,6 +45,8 @@ def iterations_figure(scenario: Scenario, plan: Any, states: np.ndarray) -> Figu
     over = _times_of_iterates(scenario, plan)
     accepted = [i for i, iterate in enumerate(plan.history) if iterate.accepted]
     iterates, over = [plan.history[i] for i in accepted], [over[i] for i in accepted]
+    if getattr(plan, "expected", None) is not None:
+        iterates, over = [*iterates, plan], [*over, plan.times]
     count = len(iterates)
     # Viridis without its palest end, which white paper swallows.
     colours = mpl.colormaps["viridis_r"](np.linspace(0.08, 1.0, count))

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from slipcar.evaluation.compare import Comparison
     from slipcar.evaluation.metrics import Result
 
-_MARKERS = "osD^vPX*"
+#: More than there are colours, so that no two rows look the same.
+_MARKERS = "osD^vPX*ph"
 #: Rows that cost more than this many times the cheapest are named beside the axes, not drawn:
 #: they would press all others into a corner.
 OFF_AXES = 5.0
@@ -49,7 +50,7 @@ def _off_axes_label(label: str, result: Result) -> str:
 def tradeoff_figure(comparison: Comparison) -> Figure:
     """Total cost against collision rate, with 95 % intervals of both."""
     with style():
-        figure = new_figure(6.4, 4.3)
+        figure = new_figure(8.8, 4.3)
         axes = figure.subplots()
         for name, look in _looks(comparison).items():
             result = comparison.results[name]
@@ -92,7 +93,12 @@ def tradeoff_figure(comparison: Comparison) -> Figure:
         _plain_log_ticks(axes.xaxis)
         axes.set_xlabel(f"collision rate [%], Wilson {CONFIDENCE:.0%} interval")
         axes.set_ylabel(f"mean cost of a path, {CONFIDENCE:.0%} interval")
-        axes.legend(loc="best", title="filled: closed loop, hollow: open loop", alignment="left")
+        figure.legend(
+            *axes.get_legend_handles_labels(),
+            loc="outside right upper",
+            title="filled: closed loop, hollow: open loop",
+            alignment="left",
+        )
     return figure
 
 

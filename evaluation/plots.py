@@ -43,14 +43,19 @@ def save_all(comparison: Comparison, folder: Path) -> list[Path]:
 
 
 def save_plan_figures(scenario: Any, plan: Any, folder: Path, seed: int = 0) -> list[Path]:
-    """Figure 1 and the covariance figure of one plan, driven in open loop."""
-    from slipcar.planner import OpenLoop
-
-    states, _ = sample_paths(OpenLoop(plan), scenario, MEASURED_PATHS, seed)
+    """Figure 1 and the covariance figure of one plan, driven as it is meant to be."""
+    states, _ = sample_paths(played(plan), scenario, MEASURED_PATHS, seed)
     written = save_figure(
         iterations_figure(scenario, plan, states[:SHOWN_PATHS]), folder, "iterations"
     )
     return written + save_figure(covariance_figure(scenario, plan, states), folder, "covariance")
+
+
+def played(plan: Any) -> Any:
+    """The controller of a plan: its feedback where it has gains, else its controls."""
+    from slipcar.planner import Feedback, OpenLoop
+
+    return OpenLoop(plan) if plan.gains is None else Feedback(plan)
 
 
 def illustrated_plan(comparison: Comparison) -> Any | None:

@@ -238,8 +238,8 @@ def play(
             action, hidden[c] = _checked_answer(controller, scenario, answer, chunk, k, first)
             control[here] = control_from_action(scenario, action, (chunk,))
         moved = transition(scenario, x, control, variates[:rows])
-        counted = [getattr(state, "failures", None) for state in hidden]
-        failures = None if any(c is None for c in counted) else np.concatenate(counted)
+        counted = [state.failures for state in hidden if hasattr(state, "failures")]
+        failures = np.concatenate(counted) if len(counted) == len(chunks) else None
         yield Step(k, control, moved, seconds, failures)
         x = moved.state
         starts = np.zeros(chunk, dtype=bool)

@@ -5,13 +5,23 @@ from __future__ import annotations
 from slipcar import baselines
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.rollout import Controller
-from slipcar.planner import Feedback, OpenLoop, plan
+from slipcar.planner import Feedback, OpenLoop, Plan, plan
+from slipcar.planner.receding_horizon import RecedingHorizon
 
 STRAIGHT = "straight (ignores obstacles)"
 DETERMINISTIC = "deterministic SCP"
 STOCHASTIC = "stochastic SCP"
 FEEDBACK = "stochastic SCP + feedback"
 PPO = "PPO"
+#: Risks that plans of the table promise: any collision on a path, at most so often.
+OPEN_RISK, FEEDBACK_RISK = 0.01, 0.001
+CHANCE = f"SCP, risk ≤ {100 * OPEN_RISK:g} %"
+STEERED = "planned feedback"
+STEERED_CHANCE = f"planned feedback, risk ≤ {100 * FEEDBACK_RISK:g} %"
+RECEDING = "receding horizon"
+RECEDING_MARGINS = "receding horizon with margins"
+#: Price of risk where none could be calibrated [cost per unit of probability].
+MARGIN_PRICE = 30.0
 #: Paired differences are taken against the paper's method as it stands: open loop.
 REFERENCE = STOCHASTIC
 
@@ -25,12 +35,15 @@ def default_rows(
     """Controllers by name, in the order of the table, and what a reader must be told of them.
 
     A straight-line driver that ignores obstacles, deterministic SCP and stochastic SCP in open
-    loop, stochastic SCP with feedback, and PPO. The shipped policy knows one scenario only: on
-    another its row is left out, and a note says so.
+    loop, stochastic SCP with feedback, PPO; then what goes beyond the paper: a chance-constrained
+    plan in open loop, plans whose feedback is planned along, without and with a bound on their
+    risk, and receding horizons without and with the price of risk that bound led to. The shipped
+    policy knows one scenario only: on another its row is left out, and a note says so.
 
     Args:
         scenario: a scenario or the name of one.
-        variance_weight: of the stochastic plans.
+        variance_weight: of stochastic SCP; the rows beyond the paper charge what the noise is
+            expected to cost, and need none.
         policy: the PPO row; None takes the shipped one.
 
     Raises:
@@ -38,7 +51,7 @@ def default_rows(
     """
     scenario = Scenario.of(scenario)
     scenario.action_scale  # noqa: B018  raises now if it is unbounded
-    notes = []
+    notes: list[str] = []
     plan(scenario)  # so that the times in the table are warm ones, without first-call costs
     deterministic = baselines.deterministic_scp(scenario)
     stochastic = plan(scenario, variance_weight=variance_weight)
@@ -49,17 +62,51 @@ def default_rows(
         FEEDBACK: Feedback(stochastic),
     }
     for name, found in ((DETERMINISTIC, deterministic), (STOCHASTIC, stochastic)):
-        if not found.status.ok:
-            notes.append(f"{name}: the plan is {found.status}, {found.status.value}.")
+        notes += plan_notes(name, found)
+    rows |= ppo_row(scenario, policy, notes)
+    rows |= _beyond_the_paper(scenario, notes)
+    return rows, notes
+
+
+def ppo_row(
+    scenario: Scenario, policy: Controller | None, notes: list[str]
+) -> dict[str, Controller]:
+    """The policy as a row, if it was trained on this scenario or given; `notes` are added to."""
     known = baselines.load_policy() if policy is None else policy
-    made_for = getattr(known, "scenario", scenario)
-    if made_for == scenario or policy is not None:
-        rows[PPO] = known
-    if made_for != scenario and policy is None:
+    trained_here = getattr(known, "scenario", scenario) == scenario
+    if policy is None and not trained_here:
         notes.append(
             f"No {PPO} row: the shipped policy was trained on another scenario. Train one with "
             "`slipcar train --scenario ...` and pass it with --policy."
         )
-    elif made_for != scenario:
+        return {}
+    if not trained_here:
         notes.append(f"{PPO}: the policy was trained on another scenario.")
-    return rows, notes
+    return {PPO: known}
+
+
+def plan_notes(name: str, found: Plan) -> list[str]:
+    """What a reader must be told of a plan: that it is no answer, if it is none."""
+    if found.status.ok:
+        return []
+    more = f" {found.message}" if found.message else ""
+    return [f"{name}: the plan is {found.status}, {found.status.value}.{more}"]
+
+
+def _beyond_the_paper(scenario: Scenario, notes: list[str]) -> dict[str, Controller]:
+    """Rows of chance constraints, planned feedback and receding horizons."""
+    plan(scenario, feedback=True)  # warm as well
+    chance = plan(scenario, risk=OPEN_RISK)
+    steered = plan(scenario, feedback=True)
+    steered_chance = plan(scenario, feedback=True, risk=FEEDBACK_RISK)
+    for name, found in ((CHANCE, chance), (STEERED, steered), (STEERED_CHANCE, steered_chance)):
+        notes += plan_notes(name, found)
+    risk = steered_chance.risk
+    price = risk.price if risk is not None and risk.reached else MARGIN_PRICE
+    return {
+        CHANCE: OpenLoop(chance),
+        STEERED: Feedback(steered),
+        STEERED_CHANCE: Feedback(steered_chance),
+        RECEDING: RecedingHorizon(scenario),
+        RECEDING_MARGINS: RecedingHorizon(scenario, risk_price=price),
+    }

@@ -223,11 +223,11 @@ def plan(
             return found
         return solve(model, options, x, u, free_first=first)
 
-    candidates: tuple[Outcome, ...] = ()
+    candidates: tuple[tuple[Array, Outcome], ...] = ()
     if starts > 1:
         tried = multistart(model, options, starts)
-        x, found, more["alternatives"] = tried.guess, tried.best, tried.alternatives
-        candidates = tried.different
+        candidates, more["alternatives"] = tried.different, tried.alternatives
+        x, found = candidates[0]
         if shooting:
             found = run(found.x, found.u)
     elif guess is None:
@@ -243,7 +243,9 @@ def plan(
         )
         problem = reposed(problem, times=model.times)
     if request.wanted and found.status not in (Status.STOPPED, Status.SOLVER_FAILED):
-        steered = steer(problem, options, request, candidates or (found,))
+        candidates = candidates or ((x, found),)
+        steered = steer(problem, options, request, [outcome for _, outcome in candidates])
+        x, found = candidates[steered.origin]
         return build_steered(
             steered,
             found,

@@ -46,6 +46,10 @@ class Problem(Protocol):
       linearised as the paper does. `control_cost_jacobian(t, x)` -> (..., m, n).
     * `control_bounds`: None, (m,) for |u| ≤ bound, or (2, m) for lower and upper.
     * `control_radius`: None, or r > 0 for ‖u‖₂ ≤ r; box and ball may be combined.
+    * `constraint(t, x)` -> h (..., p): violated where positive, for `risk` and `risk_price`; its
+      derivatives are traced or taken by complex steps. It costs nothing otherwise.
+    * `terminal_weight` (q,) ≥ 0: W of E gᵀWg, what plans with feedback charge instead of asking
+      for g(μ) = 0.
     * `initial_guess()` -> states (N, n), controls (N−1, m); otherwise the uncontrolled path
       (or the start at all times, if that path grows without bound).
     * `angles`: state components of period 2π, so that feedback wraps their errors.

@@ -110,7 +110,7 @@ class RecedingHorizon(OpenLoop):
         problem: Problem,
         *,
         risk_price: float = 0.0,
-        iterations: int = 3,
+        iterations: int = 2,
         tolerance: float = 1e-3,
         saturation: float = 2.0,
         workers: int = 1,

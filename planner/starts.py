@@ -84,15 +84,12 @@ class Starts:
     """What several guesses led to.
 
     Attributes:
-        guess: states of the guess that led to the best outcome, (N, n).
-        best: that outcome.
-        different: outcomes that are not the same answer, the best first.
+        different: outcomes that are not the same answer, each with the states (N, n) of the guess
+            that led there, the best first.
         alternatives: all that was tried, the best first; the same answers are marked.
     """
 
-    guess: Array
-    best: Outcome
-    different: tuple[Outcome, ...]
+    different: tuple[tuple[Array, Outcome], ...]
     alternatives: tuple[Alternative, ...]
 
 
@@ -103,7 +100,6 @@ def multistart(model: Model, options: Options, count: int) -> Starts:
     # One thread: several would not pay for a handful of problems.
     outcomes = solve_tasks(tasks, options, workers=1, label="guess {}")
     order = sorted(range(len(guesses)), key=lambda i: _rank(outcomes[i]))
-    best = order[0]
     classify = getattr(model.problem, "homotopy_class", None)
     rows: list[Alternative] = []
     different: list[int] = []  # of the answers above, the first of its kind
@@ -123,9 +119,7 @@ def multistart(model: Model, options: Options, count: int) -> Starts:
             row = dataclasses.replace(row, same_as=guesses[twin].label)
         rows.append(row)
     return Starts(
-        guess=guesses[best].states,
-        best=outcomes[best],
-        different=tuple(outcomes[i] for i in different),
+        different=tuple((guesses[i].states, outcomes[i]) for i in different),
         alternatives=tuple(rows),
     )
 

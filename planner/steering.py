@@ -39,6 +39,8 @@ _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
 _SEARCH_SEED, _VERIFICATION_SEED = 0x51EE, 0xF5E5
 #: Standard deviations of Monte Carlo that the search keeps below δ, and verifications at most.
 _CAUTION, _VERIFICATIONS = 1.5, 3
+#: With fewer violations expected among the paths, Boole's bound is searched with instead.
+_COUNTABLE = 10
 #: Boole's bound overestimates, as nodes are correlated, by less than this.
 _BOOLE = 10.0
 #: The first price, as a multiple of (cost of the nominal plan) / δ; and the dearest, of the first.
@@ -133,6 +135,7 @@ class Steering:
         cost: what is expected of the plan.
         risk: where one was asked for.
         message: what is lacking, or how a search went.
+        origin: which of the plans of the mean it started from.
         iterations: Newton steps in all.
     """
 
@@ -141,6 +144,7 @@ class Steering:
     cost: ExpectedCost
     risk: Risk | None
     message: str
+    origin: int
     iterations: int
 
 
@@ -157,7 +161,7 @@ def steer(
         price = request.price or 0.0
         found = field.solve(price) or field.attempt
         cost = expected_cost(ready.model, priced(stakes, price), found)
-        return Steering(found, found.status, cost, None, "", field.steps)
+        return Steering(found, found.status, cost, None, "", field.origin(found), field.steps)
     return _calibrated(problem, request, ready, field, stakes)
 
 
@@ -194,6 +198,9 @@ def _calibrated(
     paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
     noise = np.sqrt(delta * (1.0 - delta) * (1.0 / paths + 1.0 / request.episodes))
     target = max(delta - _CAUTION * float(noise), 0.3 * delta)
+    countable = delta * paths >= _COUNTABLE
+    if not countable:
+        target = delta
     simulated = 0.0
 
     def rate(found: Steered, episodes: int, seed: int) -> float:
@@ -202,6 +209,11 @@ def _calibrated(
         broken = violations(problem, law(model, found), episodes=episodes, seed=seed)
         simulated += time.perf_counter() - began
         return float(broken.mean())
+
+    def measure(found: Steered) -> float:
+        if countable:
+            return rate(found, paths, _SEARCH_SEED)
+        return expected_cost(model, stakes, found).risk
 
     def answer(found: Steered, price: float, kept: bool) -> Steering:
         cost = expected_cost(model, priced(stakes, price), found)
@@ -217,9 +229,13 @@ def _calibrated(
             simulation_time=simulated,
         )
         if kept:
-            return Steering(found, found.status, cost, risk, "", field.steps)
+            say = ""
+            if not countable:
+                say = f"{paths:,} paths cannot tell a risk of {delta:g}: Boole's bound keeps it"
+            return Steering(found, found.status, cost, risk, say, field.origin(found), field.steps)
         say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
-        return Steering(found, Status.RISK_UNREACHABLE, cost, risk, say, field.steps)
+        status = Status.RISK_UNREACHABLE
+        return Steering(found, status, cost, risk, say, field.origin(found), field.steps)
 
     tried: list[PricedRate] = []
     free = field.solve(0.0)
@@ -227,7 +243,7 @@ def _calibrated(
         # Perhaps what is cheapest is safe enough: Boole's bound says whether to look.
         cost = expected_cost(model, stakes, free)
         if cost.risk <= _BOOLE * delta:
-            share = rate(free, paths, _SEARCH_SEED)
+            share = measure(free)
             tried.append(PricedRate(0.0, cost.risk, share))
             if share <= target:
                 verified = rate(free, request.episodes, _VERIFICATION_SEED)
@@ -238,18 +254,19 @@ def _calibrated(
     for attempt in range(_VERIFICATIONS):
         search = search_price(
             lambda price, _: field.solve(price),
-            lambda found: rate(found, paths, _SEARCH_SEED),
+            measure,
             target=target,
             first=first,
             largest=_DEAREST * first,
-            resolution=1.0 / paths,
+            resolution=1.0 / paths if countable else 0.0,
         )
         tried += [PricedRate(t.price, _predicted(model, stakes, t), t.rate) for t in search.tried]
         found = search.best
         if found is None:
             cost = expected_cost(model, stakes, field.attempt)
             say = "no plan was found at any price of risk"
-            return Steering(field.attempt, Status.SOLVER_FAILED, cost, None, say, field.steps)
+            status = Status.SOLVER_FAILED
+            return Steering(field.attempt, status, cost, None, say, 0, field.steps)
         verified = rate(found, request.episodes, _VERIFICATION_SEED + attempt)
         if verified <= delta or not search.reached:
             break

@@ -93,6 +93,7 @@ class Field:
         self._guesses = list(guesses)
         self._known: list[list[tuple[float, Steered]]] = [[] for _ in guesses]
         self._alive = list(range(len(self._guesses)))
+        self._origin: dict[int, int] = {}
         x, u = self._guesses[0]
         self._iterate: Any = loop.iterate
         self._functions = None
@@ -115,6 +116,7 @@ class Field:
             found = self._one(i, price, stakes)
             if found.status.ok:
                 self._known[i].append((price, found))
+                self._origin[id(found)] = i  # it stays alive, in the line above
                 worth[i] = (value(self._model, stakes, found), found)
         order = sorted(worth, key=lambda i: worth[i][0])
         if not order:
@@ -124,6 +126,10 @@ class Field:
         near = [i for i in order if worth[i][0] <= best + (_BEHIND - 1.0) * abs(best)]
         self._alive = near[:_KEPT]
         return worth[order[0]][1]
+
+    def origin(self, found: Steered) -> int:
+        """Which guess an answer comes from."""
+        return self._origin.get(id(found), 0)
 
     def _one(self, i: int, price: float, stakes: Stakes) -> Steered:
         """Candidate i, warm from its nearest price; if that fails, from its guess."""

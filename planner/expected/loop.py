@@ -97,7 +97,9 @@ def iterate(
     gains, held = np.zeros((K, m, n)), None
     if warm is not None:
         adjoint, terminal, gains, held = warm.adjoint, warm.terminal, warm.gains, warm.held
-    belief = propagate(model, functions, at, stakes, gains, held, damping if warm is not None else 1.0)
+    belief = propagate(
+        model, functions, at, stakes, gains, held, damping if warm is not None else 1.0
+    )
     unit = float(np.max(np.diag(model.R)))
     shift, last, rejected, tried = 0.0, np.inf, 0, 0
     solver = LqSolver(K, n, m, 0 if stakes.soft else q)

@@ -77,8 +77,8 @@ def test_rows_figures(paper, replay, turning):
     states, _ = sample_paths(rows["a"], paper, 100)
     field = paper.replace(obstacles=(), goal=states[:, -1].mean(axis=0))  # nothing to hit
     c = compare(rows, field, 200, progress=False)
-    axes = plots.tradeoff_figure(c).axes[0]
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    (legend,) = plots.tradeoff_figure(c).legends
+    labels = [text.get_text() for text in legend.get_texts()]
     assert len(labels) == 3
     assert all("open loop" in label for label in labels)
     totals = {name: c.results[name].total for name in rows}
