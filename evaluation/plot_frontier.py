@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,10 @@ _CURVE_MARKERS = {OPEN_LOOP: "o", FEEDBACK: "s", RECEDING: "D"}
 _SINGLE_MARKERS = {rows.DETERMINISTIC: "^", rows.STOCHASTIC: "v", rows.FEEDBACK: "P", rows.PPO: "*"}
 _SINGLE_COLOURS = {rows.PPO: PALETTE[6]}
 _SIZES = {"*": 9.0, "P": 7.0, "^": 6.0, "v": 6.0}
+#: An axis of costs spans at least this share of them: less is rounding errors.
+_LEAST_RANGE = 0.005
+#: Length of the arrow at an upper limit, as a share of it.
+_ARROW = 0.4
 #: Shorter names, for labels in the picture.
 _SHORT = {rows.FEEDBACK: "stochastic SCP\n+ LQR feedback"}
 _COSTS = {"effort": "mean effort", "total": "mean total cost: effort + obstacles + goal"}
@@ -64,6 +69,10 @@ def frontier_figure(frontier: Frontier) -> Figure:
             axes.sharex(panels[0][0])
         for axes, _, _ in panels:
             axes.autoscale_view()
+            low, high = axes.get_ylim()
+            room = max(0.0, _LEAST_RANGE * abs(low) - (high - low)) / 2.0
+            axes.set_ylim(low - room, high + room)
+            axes.ticklabel_format(axis="y", useOffset=False)
             _percent_ticks(axes)
         figure.supxlabel(_READING, fontsize=8.0, color=INK)
         for axes, cost, part in panels:
@@ -77,7 +86,11 @@ def _panels(
     figure: Figure, where: Any, shown: list[Shown], cost: str, label: str
 ) -> list[tuple[Axes, str, list[Shown]]]:
     """Axes for one cost, and what is drawn in each: one, or two where the axis is broken."""
-    gap = widest_gap([getattr(result, cost) for _, result in shown])
+    groups: dict[str, list[float]] = {}
+    for point, result in shown:
+        name = point.method if point.method in CURVES else point.name
+        groups.setdefault(name, []).append(getattr(result, cost))
+    gap = widest_gap(list(groups.values()))
     if gap is None:
         axes = figure.add_subplot(where)
         axes.set_ylabel(label)
@@ -97,14 +110,23 @@ def _panels(
     return [(upper, cost, high), (lower, cost, low)]
 
 
-def widest_gap(values: list[float]) -> tuple[float, float] | None:
-    """Neighbours in size with nothing between over more than a third of the range, or None."""
-    ordered = np.sort(np.asarray(values, dtype=float))
-    if len(ordered) < 2:
-        return None
-    widest = int(np.argmax(np.diff(ordered)))
-    low, high = float(ordered[widest]), float(ordered[widest + 1])
-    return (low, high) if high - low > (ordered[-1] - ordered[0]) / 3.0 else None
+def widest_gap(groups: Sequence[Sequence[float]]) -> tuple[float, float] | None:
+    """Where an axis can be broken: between groups, over more than a third of the range of all.
+
+    Args:
+        groups: numbers that must stay on one side of the gap together.
+
+    Returns:
+        The numbers next to the gap, below and above; None if there is none so wide.
+    """
+    spans = sorted((min(group), max(group)) for group in groups if len(group))
+    best, width = None, (max((high for _, high in spans), default=0.0) - spans[0][0]) / 3.0
+    reached = spans[0][1]
+    for low, high in spans[1:]:
+        if low - reached > width:
+            best, width = (reached, low), low - reached
+        reached = max(reached, high)
+    return best
 
 
 def _colour(point: Point) -> str:
@@ -119,12 +141,14 @@ def _place_of(result: Result, cost: str) -> tuple[float, float]:
 
 def _bars(shown: list[Shown], cost: str) -> list[np.ndarray]:
     """The intervals of the rates, as lines that names should not cover."""
-    return [
-        np.column_stack([100.0 * np.array(result.collision_interval), np.full(2, mean)])
-        for _, result in shown
-        for mean in (getattr(result, cost),)
-        if result.collision_rate > 0.0
-    ]
+    lines = []
+    for _, result in shown:
+        at, mean = _place_of(result, cost)
+        ends = 100.0 * np.array(result.collision_interval)
+        if result.collision_rate == 0.0:
+            ends[0] = (1.0 - _ARROW) * at
+        lines.append(np.column_stack([ends, np.full(2, mean)]))
+    return lines
 
 
 def _draw_point(axes: Axes, point: Point, result: Result, cost: str) -> None:
@@ -138,7 +162,7 @@ def _draw_point(axes: Axes, point: Point, result: Result, cost: str) -> None:
         at,
         mean,
         # Nothing observed: the rate lies somewhere below, which an arrow to the left says.
-        xerr=[[max(at - low, 0.0)], [max(high - at, 0.0)]] if seen else [[0.4 * at], [0.0]],
+        xerr=[[max(at - low, 0.0)], [max(high - at, 0.0)]] if seen else [[_ARROW * at], [0.0]],
         yerr=error,
         xuplims=not seen,
         color=colour,
@@ -181,11 +205,16 @@ def _labels(shown: list[Shown], cost: str) -> list[Label]:
             look: dict[str, Any] = {"fontsize": 9.0, "fontweight": "bold"}
             # Highest price first: there the curves are furthest from each other.
             labels.append(Label(method, np.array(curve[::-1]), _COLOURS[method], look=look))
+    costs = [getattr(result, cost) for _, result in shown]
+
+    def alike(a: np.ndarray, b: np.ndarray) -> bool:
+        return abs(np.log(a[0] / b[0])) < 0.15 and abs(a[1] - b[1]) < 0.03 * np.ptp(costs)
+
     named: list[tuple[np.ndarray, str, str]] = []
     for point, result in shown:
         if point.method not in CURVES:
             name, at = _SHORT.get(point.name, point.name), np.array(_place_of(result, cost))
-            if named and named[-1][2] == _colour(point) and np.allclose(at, named[-1][0], 0.05):
+            if named and named[-1][2] == _colour(point) and alike(at, named[-1][0]):
                 name = f"{named.pop()[1]},\n{name}"  # one on top of the other: named together
             named.append((at, name, _colour(point)))
     labels += [Label(name, at[None], colour, look={"fontsize": 8.0}) for at, name, colour in named]

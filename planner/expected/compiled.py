@@ -82,8 +82,9 @@ def _iterate(
     if not warm:
         gains[:], held[:], adjoint[:], nu[:] = 0.0, 0.0, 0.0, 0.0
     propagate(
-        addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation, damping, not warm, lower, upper,
-        gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound, high_bound,
+        addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation,
+        damping, not warm, lower, upper, gains, held, closed, Sigma, bend, offset, s, P, vg, vh,
+        low_bound, high_bound,
     )  # fmt: skip
     # Where the end is charged its condition is left out: a system so soft has the multiplier 0.
     kappa, seen = 0.0, 1.0 / SOFTNESS
@@ -197,8 +198,9 @@ def _iterate(
             for j in range(q_):
                 nu[j] = 2.0 * W[j] * at[12][j]
         propagate(
-            addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation, damping, False, lower, upper,
-            gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound, high_bound,
+            addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation,
+            damping, False, lower, upper, gains, held, closed, Sigma, bend, offset, s, P, vg, vh,
+            low_bound, high_bound,
         )  # fmt: skip
         if alpha == 1.0 and step + last <= tolerance and _consistent(at, soft, tuning):
             status = CONVERGED
