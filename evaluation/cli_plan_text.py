@@ -34,9 +34,10 @@ def summary(found: Any, first_seconds: float) -> str:
         lines.append(_expected(found.expected))
     if found.risk is not None:
         lines.append(str(found.risk))
+        alone = found.solve_time - found.risk.simulation_time
         lines.append(
-            f"{len(found.risk.tried)} prices tried, {found.risk.simulation_time:.2f} s of it Monte "
-            f"Carlo; planning alone {_milliseconds(found.solve_time - found.risk.simulation_time)} ms"
+            f"{len(found.risk.tried)} prices tried; {found.risk.simulation_time:.2f} s of Monte "
+            f"Carlo, {_milliseconds(alone)} ms of planning"
         )
     if found.time_search:
         lines.append(

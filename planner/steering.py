@@ -33,7 +33,7 @@ from slipcar.planner.status import Status
 Array = np.ndarray
 
 #: Paths that the search for a price looks at: so many violations are expected among them.
-_COUNTED = 400
+_COUNTED = 1000
 _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
 #: Common random numbers of the search, and those of each verification, which it never saw.
 _SEARCH_SEED, _VERIFICATION_SEED = 0x51EE, 0xF5E5

@@ -163,7 +163,8 @@ def optimal_gain(A, B, P, R, dt, gain):
 @numba.njit(error_model="numpy")
 def propagate(
     addresses, parameters, times, at, dt, R, weight, tail, W, feedback, w, saturation, damping,
-    fresh, lower, upper, gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound, high_bound,
+    fresh, lower, upper, gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound,
+    high_bound,
 ):  # fmt: skip
     """`belief.propagate`; writes from `gains` on. `fresh`: there are no weights to start from."""
     A, B, sigma, d_sigma, C, c, Hxx, G = at[1], at[2], at[3], at[4], at[8], at[7], at[11], at[13]

@@ -9,10 +9,11 @@ With rows' derivatives by variance η and J the quadratic in deviations that fol
 
 the expected cost is that of the mean plus Σ_k dt tr(P_{k+1} σ_k σ_kᵀ), and P is its derivative by
 the noise that arrives at a node. Rows are Gaussian with the expectation c(μ) + ½ tr(∂²c Σ) and
-the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more distance than its mean does. Held while a step is computed, P makes the noise a cost of the
-deterministic states σ depends on: the sensitivity of every later Σ is in it. That η and K would
-follow is of second order at a solution, where K is optimal. What is neglected is how ∂b/∂x, C and
-½ tr(∂²c Σ) follow.
+the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more distance than its mean does.
+
+Held while a step is computed, P makes the noise a cost of the deterministic states σ depends on:
+the sensitivity of every later Σ is in it. That η and K would follow is of second order at a
+solution, where K is optimal. What is neglected is how ∂b/∂x, C and ½ tr(∂²c Σ) follow.
 """
 
 from __future__ import annotations
