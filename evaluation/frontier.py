@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 PRICES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 RECEDING_PRICES = (0.0, 3.0, 10.0, 30.0)
 #: Episodes a point by default; replanning costs a thousand times what playing a plan does.
-EPISODES, RECEDING_EPISODES = 50_000, 5_000
+EPISODES, RECEDING_EPISODES = 50_000, 4_096
 #: The methods that have a curve, and the family of all others.
 OPEN_LOOP, FEEDBACK, RECEDING = "open loop", "planned feedback", "receding horizon"
 CURVES = (OPEN_LOOP, FEEDBACK, RECEDING)
@@ -88,7 +88,8 @@ def frontier(
         prices: of risk, for open loop and planned feedback, each finite and >= 0; none leaves both
             curves out.
         receding_prices: the same for the receding horizon.
-        receding_episodes: its episodes a point, >= 1: the first of the same Brownian paths.
+        receding_episodes: its episodes a point, >= 1, but at most `episodes`: the first of the
+            same Brownian paths.
         policy: the PPO point; None takes the shipped one, where it was trained for the scenario.
         substeps: Euler–Maruyama steps in each control interval.
         n_jobs: worker processes; the numbers do not depend on it.
@@ -101,7 +102,9 @@ def frontier(
     """
     scenario = Scenario.of(scenario)
     check_counts(episodes, seed, substeps, None, n_jobs)
-    checked_int("receding_episodes", receding_episodes, at_least=1)
+    receding_episodes = min(
+        checked_int("receding_episodes", receding_episodes, at_least=1), episodes
+    )
     points, notes = candidates(
         scenario,
         checked_prices("prices", prices),

@@ -102,7 +102,12 @@ def _panels(
     upper.tick_params(axis="x", which="both", bottom=False, labelbottom=False)
     lower.set_ylabel(label, y=1.05)
     lower.set_xlabel(_RATE)
-    mark = {"marker": [(-1, -0.6), (1, 0.6)], "markersize": 8, "linestyle": "none", "color": INK}
+    mark: dict[str, Any] = {
+        "marker": [(-1, -0.6), (1, 0.6)],
+        "markersize": 8,
+        "linestyle": "none",
+        "color": INK,
+    }
     upper.plot([0], [0], transform=upper.transAxes, clip_on=False, **mark)
     lower.plot([0], [1], transform=lower.transAxes, clip_on=False, **mark)
     high = [row for row in shown if getattr(row[1], cost) >= gap[1]]
@@ -120,13 +125,15 @@ def widest_gap(groups: Sequence[Sequence[float]]) -> tuple[float, float] | None:
         The numbers next to the gap, below and above; None if there is none so wide.
     """
     spans = sorted((min(group), max(group)) for group in groups if len(group))
-    best, width = None, (max((high for _, high in spans), default=0.0) - spans[0][0]) / 3.0
-    reached = spans[0][1]
+    if not spans:
+        return None
+    whole = max(high for _, high in spans) - spans[0][0]
+    gaps, reached = [], spans[0][1]
     for low, high in spans[1:]:
-        if low - reached > width:
-            best, width = (reached, low), low - reached
+        gaps.append((low - reached, reached, low))
         reached = max(reached, high)
-    return best
+    width, below, above = max(gaps, default=(0.0, 0.0, 0.0))
+    return (below, above) if width > whole / 3.0 else None
 
 
 def _colour(point: Point) -> str:

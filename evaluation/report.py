@@ -52,9 +52,14 @@ def with_error(key: str) -> Callable[[Any], str]:
     return lambda row: f"{row[key]:.3f} ± {row[f'{key}_se']:.3f}"
 
 
-def _collisions(row: Any) -> str:
-    rate, low, high = (100 * row[f"collision_{part}"] for part in ("rate", "low", "high"))
-    return f"{rate:.2f} [{low:.2f}, {high:.2f}]"
+def collisions(digits: int) -> Callable[[Any], str]:
+    """Text of the collision rate and its interval, in percent."""
+
+    def text(row: Any) -> str:
+        rate, low, high = (100 * row[f"collision_{part}"] for part in ("rate", "low", "high"))
+        return f"{rate:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+    return text
 
 
 def _difference(key: str, scale: float, digits: int) -> Callable[[Any], str]:
@@ -82,7 +87,7 @@ def _duration(key: str) -> Callable[[Any], str]:
 
 LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
 TOTAL = Column("total cost", with_error("total"), "total")
-COLLISIONS = Column("collisions [%]", _collisions, "collision_rate")
+COLLISIONS = Column("collisions [%]", collisions(2), "collision_rate")
 _PARTS = ("effort", "obstacle", "goal")
 COST = (LOOP, TOTAL, *(Column(part, with_error(part)) for part in _PARTS), COLLISIONS)
 #: The same for a terminal, where columns are dear.

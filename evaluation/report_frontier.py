@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slipcar.evaluation import report
+from slipcar.evaluation.frontier import RECEDING
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 COLUMNS = (
     report.LOOP,
-    dataclasses.replace(report.COLLISIONS, best=None),
+    report.Column("collisions [%]", report.collisions(3)),
     report.Column("effort", report.with_error("effort"), marked="effort_front"),
     report.Column("total cost", report.with_error("total"), marked="total_front"),
 )
@@ -31,10 +31,11 @@ TABLES: report.Captioned = [
 
 def setting(frontier: Frontier) -> str:
     """A sentence or two on what was run."""
-    return (
-        f"{report.setting(frontier.comparison)} The receding horizon drove the first "
-        f"{frontier.receding_episodes:,} of them."
-    )
+    told = report.setting(frontier.comparison)
+    fewer = frontier.receding_episodes < frontier.comparison.episodes
+    if fewer and any(point.method == RECEDING for point in frontier.points):
+        told += f" The receding horizon drove the first {frontier.receding_episodes:,} of them."
+    return told
 
 
 def markdown(frontier: Frontier) -> str:
@@ -77,7 +78,7 @@ def save(frontier: Frontier, folder: Path, figures: bool) -> list[Path]:
             "results.json": report.json_text(frontier.comparison, frontier.frame),
         },
     )
-    if figures:
+    if figures and frontier.comparison.results:
         with report.tables_are_in(folder):
             from slipcar.evaluation import plot_frontier
         figure = plot_frontier.frontier_figure(frontier)

@@ -146,7 +146,8 @@ def test_weights_are_the_derivative_by_the_noise_that_arrives(settled):
     rng = np.random.default_rng(3)
     # At a fixed point the weights that are held are those the spread asks for.
     wanted = belief.loss_at(model, stakes, at.lin.c, now.s).by_variance
-    np.testing.assert_allclose(now.held, wanted, rtol=1e-6, atol=1e-9)
+    # (None is held below 1e-9 of the largest.)
+    np.testing.assert_allclose(now.held, wanted, rtol=1e-6, atol=2e-9 * wanted.max())
     for k in range(len(model.dt)):
         F = rng.normal(size=(N, 2))
         extra, h = np.zeros((len(model.dt), N, N)), 1e-6
