@@ -128,15 +128,14 @@ def measure(
     episodes: int = EPISODES,
     receding_episodes: int = RECEDING_EPISODES,
     risk_episodes: int = EPISODES,
+    turned: Sequence[bool] = (False, True),
 ) -> Found:
     """All rows on so many worlds of each family; receding horizons unless their episodes are 0."""
     found: Found = {name: [] for name in NAMES if receding_episodes or "receding" not in name}
-    pairs = [(seed, turned) for turned in (False, True) for seed in range(worlds)]
-    for rows in (_plans(Scenario.random(0), 1000), _receding(Scenario.random(0), 0.0)):
-        for _ in rows:  # imports and compiles
-            pass
-    for seed, turned in track(pairs, "risk: worlds", console=Console(stderr=True)):
-        scenario = Scenario.random(seed, turned=turned)
+    pairs = [(seed, family) for family in turned for seed in range(worlds)]
+    list(_plans(Scenario.random(0), 1000))  # imports and compiles
+    for seed, family in track(pairs, "risk: worlds", console=Console(stderr=True)):
+        scenario = Scenario.random(seed, turned=family)
         done: dict[str, Any] = {}
         price = math.nan
         for name, p, controller in _plans(scenario, risk_episodes):
@@ -145,10 +144,14 @@ def measure(
                 price = p.risk.price
         if receding_episodes:
             for name, p, controller in _receding(scenario, price):
-                done[name] = (p, controller, evaluate(controller, scenario, receding_episodes, SEED))
+                done[name] = (
+                    p,
+                    controller,
+                    evaluate(controller, scenario, receding_episodes, SEED),
+                )
         reference = done[SCP_STARTS][2]
         for name, (p, controller, driven) in done.items():
-            found[name].append(_result(seed, turned, p, controller, driven, reference))
+            found[name].append(_result(seed, family, p, controller, driven, reference))
     return found
 
 
@@ -169,7 +172,7 @@ def _plans(scenario: Scenario, risk_episodes: int) -> Iterator[tuple[str, Plan, 
 
 def _receding(scenario: Scenario, price: float) -> Iterator[tuple[str, Plan, Controller]]:
     """Receding horizons, the one with margins if there is a price."""
-    from slipcar.planner import RecedingHorizon
+    from slipcar.planner.receding_horizon import RecedingHorizon
 
     controller = RecedingHorizon(scenario)
     yield RECEDING, controller.plan, controller
@@ -318,7 +321,9 @@ def notes(found: Found, shown: int = 15) -> list[str]:
     lines = []
     for name, results in found.items():
         lists = {
-            "did not keep its promise": [r for r in results if r.ok and r.interval[0] > r.requested],
+            "did not keep its promise": [
+                r for r in results if r.ok and r.interval[0] > r.requested
+            ],
             "refused": [r for r in results if r.status == "RISK_UNREACHABLE"],
             "failed": [r for r in results if r.status not in ("CONVERGED", "RISK_UNREACHABLE")],
         }

@@ -18,13 +18,16 @@ import page
 import peers
 import planners
 import report
+import risk_paper
+import risk_times
+import risk_worlds
 import simulation
 import turns
 import worlds
 
-PARTS = ("planners", "growth", "cold", "simulation")
+PARTS = ("planners", "growth", "cold", "simulation", "risk_times")
 #: Minutes; on request.
-LONG_PARTS = ("worlds",)
+LONG_PARTS = ("worlds", "risk_paper", "risk")
 
 
 def main() -> None:
@@ -35,7 +38,10 @@ def main() -> None:
         "growth": functools.partial(growth.section, max(arguments.rounds // 2, 1), folder),
         "cold": cold.section,
         "simulation": simulation.section,
+        "risk_times": functools.partial(risk_times.section, arguments.rounds),
         "worlds": functools.partial(worlds.section, arguments.seeds, folder),
+        "risk_paper": risk_paper.section,
+        "risk": functools.partial(risk_worlds.section, arguments.risk_worlds, folder),
     }
     for part in arguments.only:
         began = time.perf_counter()
@@ -54,7 +60,7 @@ def _arguments() -> argparse.Namespace:
         "--only",
         choices=PARTS + LONG_PARTS,
         nargs="*",
-        help=f"parts to run (default: {' '.join(PARTS)}, and worlds with --docs)",
+        help=f"parts to run (default: {' '.join(PARTS)}, all with --docs)",
     )
     parser.add_argument(
         "--docs",
@@ -62,6 +68,12 @@ def _arguments() -> argparse.Namespace:
         help="write docs/benchmarks.md, from this run and the parts already in the folder",
     )
     parser.add_argument("--seeds", type=int, default=worlds.SEEDS, help="random worlds")
+    parser.add_argument(
+        "--risk-worlds",
+        type=int,
+        default=risk_worlds.WORLDS,
+        help="random worlds of either family for the risk (default: %(default)s)",
+    )
     parser.add_argument("--rounds", type=int, default=turns.ROUNDS, help="plans per contender")
     parser.add_argument(
         "--peers-python",
@@ -75,6 +87,8 @@ def _arguments() -> argparse.Namespace:
         parser.error(f"--rounds must be at least 1, not {arguments.rounds}")
     if arguments.seeds < 1:
         parser.error(f"--seeds must be at least 1, not {arguments.seeds}")
+    if arguments.risk_worlds < 1:
+        parser.error(f"--risk-worlds must be at least 1, not {arguments.risk_worlds}")
     if arguments.only is None:
         arguments.only = PARTS + LONG_PARTS if arguments.docs else PARTS
     return arguments

@@ -20,12 +20,15 @@ def compare(
     figures: bool = True,
     resume: bool = True,
 ) -> int:
-    """Compare stochastic SCP, deterministic SCP and PPO over the same Brownian paths.
+    """Compare SCP, feedback, receding horizons and PPO over the same Brownian paths.
 
-    Five rows: a driver that takes the straight line and ignores obstacles, deterministic SCP
-    and stochastic SCP (open loop), stochastic SCP with feedback and PPO (closed loop). Prints
-    a table and writes table.md, .csv, .tex, results.json and the figures into the folder.
-    Finished rows are kept there: run it again after an interruption and it continues.
+    Ten rows: a driver that takes the straight line and ignores obstacles, deterministic SCP
+    and stochastic SCP (open loop), stochastic SCP with feedback and PPO (closed loop); then,
+    beyond the paper, a plan whose risk is at most 1 % (open loop), plans whose feedback is
+    planned along, one of them with a risk of at most 0.1 %, and receding horizons, without and
+    with margins against risk (closed loop). Prints a table and writes table.md, .csv, .tex,
+    results.json and the figures into the folder. Finished rows are kept there: run it again
+    after an interruption and it continues.
 
         slipcar compare
         slipcar compare --scenario slalom --episodes 100000 --workers 2
@@ -38,7 +41,7 @@ def compare(
         episodes: per row, at least 1. The error of a rate falls as 1/sqrt(episodes).
         seed: of the Brownian paths, at least 0. The same seed gives the same table.
         folder: where tables, figures and finished rows go.
-        variance_weight: weight of the integral of tr Sigma in the stochastic plans [1/(m2 s)].
+        variance_weight: weight of the integral of tr Sigma in stochastic SCP [1/(m2 s)].
         policy: a trained policy (.safetensors file or folder) instead of the shipped one.
         substeps: Euler-Maruyama steps in each control interval.
         workers: processes that share each row's episodes; the numbers do not depend on it.
@@ -48,10 +51,12 @@ def compare(
     from slipcar.baselines import load_policy
     from slipcar.evaluation import compare as compare_controllers
     from slipcar.evaluation import report
+    from slipcar.evaluation.rollout import check_counts
     from slipcar.evaluation.rows import REFERENCE, default_rows
 
     out = console()
     world = read_scenario(scenario)
+    check_counts(episodes, seed, substeps, None, workers)  # before any planning
     rows, notes = default_rows(
         world,
         variance_weight=variance_weight,

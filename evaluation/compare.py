@@ -73,7 +73,7 @@ def evaluate(
         seed=seed,
         substeps=substeps,
         closed_loop=bool(getattr(controller, "closed_loop", True)),
-        failures=solver_failures(controller),
+        failures=solver_failures(controller) if done.failures is None else done.failures,
         inference_time=done.inference_time,
         preparation_time=float("nan") if preparation is None else float(preparation),
         wall_time=time.perf_counter() - began,

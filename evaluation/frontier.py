@@ -98,10 +98,13 @@ def frontier(
         progress: whether to show a bar for each point.
 
     Raises:
-        ValueError: for a bad argument, or a scenario that cannot be driven or planned.
+        ValueError: for a bad argument, or a scenario without obstacles or that cannot be driven or
+            planned.
     """
     scenario = Scenario.of(scenario)
     check_counts(episodes, seed, substeps, None, n_jobs)
+    if not len(scenario.obstacles):
+        raise ValueError("a frontier needs a scenario with obstacles: without, nothing is risked")
     receding_episodes = min(
         checked_int("receding_episodes", receding_episodes, at_least=1), episodes
     )

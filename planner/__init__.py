@@ -16,6 +16,7 @@ from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.plan import Plan
 from slipcar.planner.planning import plan
 from slipcar.planner.problem import Problem
+from slipcar.planner.receding_horizon import RecedingHorizon
 from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
 from slipcar.planner.risk import Risk
 from slipcar.planner.status import Status
@@ -30,6 +31,7 @@ __all__ = [
     "OpenLoop",
     "Plan",
     "Problem",
+    "RecedingHorizon",
     "Risk",
     "Status",
     "TimeStep",

@@ -183,19 +183,15 @@ class Replanner:
             ValueError: if the problem's functions are not finite along them.
         """
         iterate = loop.iterate if self.run is None else self.run.iterate
-        # The constraints' price bends what the penalties alone have led to: one after the other.
-        free = dataclasses.replace(
-            self.stakes, weight=np.where(self.stakes.tail, 0.0, self.stakes.weight)
+        found: loop.Steered = iterate(
+            self.model,
+            self.functions,
+            self.stakes,
+            x,
+            u,
+            tolerance=self.tolerance,
+            max_iterations=max_iterations,
         )
-        limits: dict[str, Any] = {
-            "tolerance": self.tolerance,
-            "max_iterations": max_iterations,
-        }
-        found = iterate(self.model, self.functions, free, x, u, **limits)
-        if (free.weight != self.stakes.weight).any():
-            found = iterate(
-                self.model, self.functions, self.stakes, found.x, found.u, warm=found, **limits
-            )
         return found
 
     def _compiled(

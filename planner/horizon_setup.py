@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from slipcar.planner.expected.field import priced
 from slipcar.planner.expected.guarded import posed
 from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.stakes import Stakes
@@ -19,38 +21,22 @@ from slipcar.planner.newton.functions import Functions
 from slipcar.planner.options import Options
 from slipcar.planner.plan import Plan
 from slipcar.planner.problem import Model
+from slipcar.planner.steering import Request
 
 Array = np.ndarray
 
-#: Where the problem has no `terminal_weight`, feedback is charged so much for what it leaves of
-#: the terminal condition; as `Feedback`'s Qf.
-TERMINAL_WEIGHT = 100.0
-
 
 def stakes_of(problem: Any, risk_price: float, saturation: float) -> Stakes:
-    """What every replan is charged."""
-    guarded = posed(problem).guarded
-    priced = guarded.is_constraint
-    if risk_price > 0.0 and not priced.any():
+    """What every replan is charged: what a plan with feedback is."""
+    ready = posed(problem)
+    if risk_price > 0.0 and not ready.guarded.is_constraint.any():
         raise ValueError(
             f"risk_price={risk_price:g} needs a problem with constraint(t, x) -> (..., p), "
             f"violated where > 0, which {type(problem).__name__} has not"
         )
     q = np.shape(problem.terminal(np.asarray(problem.start, dtype=np.float64)))[-1]
-    weight = getattr(problem, "terminal_weight", None)
-    soft = weight is not None
-    W = np.asarray(weight if soft else np.full(q, TERMINAL_WEIGHT), dtype=np.float64)
-    if W.shape != (q,) or not np.isfinite(W).all() or (W < 0.0).any():
-        raise ValueError(f"terminal_weight must be ({q},) finite numbers >= 0, not {weight!r}")
-    return Stakes(
-        weight=np.where(priced, risk_price, guarded.penalty_weight),
-        tail=priced,
-        terminal=W,
-        soft=soft,
-        feedback=True,
-        variance_weight=0.0,
-        saturation=saturation,
-    )
+    stakes = priced(Request(feedback=True).stakes(ready, q, 0.0), risk_price)
+    return dataclasses.replace(stakes, saturation=saturation)
 
 
 def handover_of(model: Model, stakes: Stakes, given: Any) -> int:

@@ -128,7 +128,8 @@ def plan(
         expected: charge the penalties' expectation, E Σ w max(0, c)² for Gaussian states, instead
             of their value at the mean. With `risk`, `risk_price` and `feedback` it always is.
         terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0.
-            None: exact, or with `feedback` the problem's `terminal_weight`, if it has one.
+            None: exact, or with `feedback` the problem's `terminal_weight`, if it has one; if not,
+            exact for the mean, and the spread charged 100 tr Cov g.
         check_derivatives: compare every Jacobian with differences before planning.
         callback: called with each :class:`Iteration`, from whichever guess and at whichever
             horizon; returning True stops that guess (all others begin nonetheless) and any search

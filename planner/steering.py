@@ -32,6 +32,8 @@ from slipcar.planner.status import Status
 
 Array = np.ndarray
 
+#: What feedback is charged for the spread of g where nothing else is; as `Feedback`'s Qf.
+_SPREAD_WEIGHT = 100.0
 #: Paths that the search for a price looks at: so many violations are expected among them.
 _COUNTED = 1000
 _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
@@ -75,16 +77,20 @@ class Request:
                     "risk and risk_price exclude each other: risk=δ searches for the price"
                 )
         if self.price is not None:
+            if isinstance(self.price, (bool, np.bool_)):
+                raise ValueError(f"risk_price must be a number >= 0, not {self.price!r}")
             check_number("risk_price", self.price, zero_allowed=True)
         check_count("risk_episodes", self.episodes, least=100)
         for name in ("feedback", "expected"):
             if getattr(self, name) not in (True, False):
                 raise ValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
-        if self.terminal_weight is not None and not self.wanted:
-            raise ValueError(
-                "terminal_weight is of expected costs: it needs feedback, expected, risk or "
-                "risk_price"
-            )
+        if self.terminal_weight is not None:
+            _numbers(self.terminal_weight)
+            if not self.wanted:
+                raise ValueError(
+                    "terminal_weight is of expected costs: it needs feedback, expected, risk or "
+                    "risk_price"
+                )
 
     @property
     def wanted(self) -> bool:
@@ -115,10 +121,11 @@ class Request:
         given = self.terminal_weight
         if given is None and self.feedback:
             given = getattr(guarded.problem, "terminal_weight", None)
+        spread = _SPREAD_WEIGHT if self.feedback else 0.0
         return Stakes(
             weight=guarded.penalty_weight,
             tail=guarded.is_constraint,
-            terminal=np.zeros(q) if given is None else _checked_terminal(given, q),
+            terminal=np.full(q, spread) if given is None else _checked_terminal(given, q),
             soft=given is not None,
             feedback=self.feedback,
             variance_weight=w,
@@ -161,7 +168,8 @@ def steer(
         price = request.price or 0.0
         found = field.solve(price) or field.attempt
         cost = expected_cost(ready.model, priced(stakes, price), found)
-        return Steering(found, found.status, cost, None, "", field.origin(found), field.steps)
+        say = "" if found.status.ok else "the iteration on the expected cost did not settle"
+        return Steering(found, found.status, cost, None, say, field.origin(found), field.steps)
     return _calibrated(problem, request, ready, field, stakes)
 
 
@@ -264,7 +272,7 @@ def _calibrated(
         found = search.best
         if found is None:
             cost = expected_cost(model, stakes, field.attempt)
-            say = "no plan was found at any price of risk"
+            say = f"no plan was found at any price of risk: the last ended {field.attempt.status}"
             status = Status.SOLVER_FAILED
             return Steering(field.attempt, status, cost, None, say, 0, field.steps)
         verified = rate(found, request.episodes, _VERIFICATION_SEED + attempt)
@@ -276,11 +284,15 @@ def _calibrated(
     return answer(found, search.price, bool(search.reached and verified <= delta))
 
 
-def _checked_terminal(given: Any, q: int) -> Array:
+def _numbers(given: Any) -> Array:
     try:
-        weight = np.asarray(given, dtype=np.float64)
+        return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"terminal_weight must be numbers, not {given!r}") from error
+        raise ValueError(f"terminal_weight must be numbers >= 0, not {given!r}") from error
+
+
+def _checked_terminal(given: Any, q: int) -> Array:
+    weight = _numbers(given)
     if weight.ndim == 0:
         weight = np.full(q, float(weight))
     if weight.shape != (q,) or not np.isfinite(weight).all() or (weight < 0.0).any():

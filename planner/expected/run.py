@@ -126,11 +126,9 @@ def advance(
     d = kernels.stage.outputs["sigma"] // batch.x.shape[2]
 
     def shared(value: Any) -> Array:
-        row = np.array(value, dtype=np.float64, order="C")
-        # One row in memory for all problems: numba sees the same type with a stride of zero.
-        return np.lib.stride_tricks.as_strided(
-            row, (P, *row.shape), (0, *row.strides), writeable=True
-        )
+        # Copied, because numba takes an array with a stride of zero for one of another type.
+        row = np.asarray(value, dtype=np.float64)
+        return np.array(np.broadcast_to(row, (P, *row.shape)), order="C")
 
     same = [shared(v) for v in (parameters, grid, model.R, model.lower, model.upper, stakes.weight)]
     tail = np.array(stakes.tail, dtype=np.bool_)

@@ -34,6 +34,7 @@ def test_help_teaches(capsys):
             "--figures",
             "--compare-methods",
         ],
+        "frontier": ["--episodes", "--scenario", "--out", "--seed", "--workers", "--prices"],
         "simulate": ["--gif", "--frames", "--human", "feedback", "straight", "ppo"],
         "train": ["--total-steps", "--learning-rate", "--folder", "--seed"],
     }
@@ -68,6 +69,9 @@ def test_help_teaches(capsys):
         (["simulate", "scp", "--episodes", "51", "--gif", "a.gif"], "at most 50"),
         (["simulate", "scp", "--gif", "a.mp4"], "ends in .gif"),
         (["compare", "--policy", "missing"], "missing"),
+        (["frontier", "--episodes", "0"], "episodes must be at least 1, not 0"),
+        (["frontier", "--prices", "1", "-1"], "prices must be finite and >= 0, not -1"),
+        (["frontier", "--scenario", "moon"], "unknown scenario 'moon'"),
         (["train", "--learning-rate", "-1"], "learning_rate"),
         (["train", "--minibatches", "3"], "minibatches must divide"),
     ],

@@ -5,6 +5,22 @@ import pytest
 
 from slipcar.evaluation import compare, evaluate, sample_paths
 from slipcar.evaluation.compare import solver_failures
+from slipcar.evaluation.rows import (
+    CHANCE,
+    DETERMINISTIC,
+    FEEDBACK,
+    FEEDBACK_RISK,
+    OPEN_RISK,
+    PPO,
+    RECEDING,
+    RECEDING_MARGINS,
+    REFERENCE,
+    STEERED,
+    STEERED_CHANCE,
+    STOCHASTIC,
+    STRAIGHT,
+    default_rows,
+)
 from slipcar.planner import Feedback, OpenLoop, plan
 
 
@@ -77,22 +93,33 @@ def test_a_plan_that_did_not_converge_is_seen_in_the_table(paper):
 
 
 def test_default_rows(paper, replay):
-    from slipcar.evaluation.rows import DETERMINISTIC, FEEDBACK, REFERENCE, STRAIGHT, default_rows
-
     rows, notes = default_rows(paper, policy=replay(paper, (0.0, 0.0)))
     assert notes == []
-    loops = {name: getattr(controller, "closed_loop", True) for name, controller in rows.items()}
-    assert list(loops.values()) == [False, False, False, True, False]
-    c = compare(rows, paper, 2000, reference=REFERENCE, progress=False)
+    assert list(rows) == [
+        *(STRAIGHT, DETERMINISTIC, STOCHASTIC, FEEDBACK, PPO),
+        *(CHANCE, STEERED, STEERED_CHANCE, RECEDING, RECEDING_MARGINS),
+    ]
+    closed = {name for name, controller in rows.items() if getattr(controller, "closed_loop", True)}
+    assert closed == {FEEDBACK, STEERED, STEERED_CHANCE, RECEDING, RECEDING_MARGINS}
+    replanned = {name: rows.pop(name) for name in (RECEDING, RECEDING_MARGINS)}
+    c = compare(rows, paper, 10_000, reference=REFERENCE, progress=False)
     assert not c.errors
     rate = c.frame["collision_rate"]
-    assert rate[STRAIGHT] > rate[DETERMINISTIC] > rate[FEEDBACK]
-    assert c.frame.loc[FEEDBACK, "total_difference_high"] < 0.0
+    assert rate[STRAIGHT] > rate[DETERMINISTIC] > rate[FEEDBACK] > rate[STEERED]
+    # What was promised, as far as so many paths can tell.
+    assert c.frame.loc[CHANCE, "collision_low"] <= OPEN_RISK < rate[STOCHASTIC]
+    assert c.frame.loc[STEERED_CHANCE, "collision_low"] <= FEEDBACK_RISK < rate[STEERED]
+    for name in (FEEDBACK, STEERED, STEERED_CHANCE):
+        assert c.frame.loc[name, "total_difference_high"] < 0.0
+    few = compare(rows | replanned, paper, 128, reference=STOCHASTIC, progress=False).frame
+    assert few.loc[[*replanned], "failures"].eq(0).all()
+    assert few.loc[[*replanned], "total_difference_high"].lt(0.0).all()
+    safer, cheaper = few.loc[RECEDING_MARGINS], few.loc[RECEDING]
+    assert safer["obstacle"] < cheaper["obstacle"]
+    assert safer["effort"] > cheaper["effort"]
 
 
 def test_default_rows_speak_of_plans_that_failed(paper, replay):
-    from slipcar.evaluation.rows import default_rows
-
     # Nearly four metres in half a second: not within these bounds.
     hopeless = paper.replace(horizon=0.5)
     _, notes = default_rows(hopeless, policy=replay(hopeless, (0.0, 0.0)))

@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
+from scipy.stats import rice
 
 from slipcar.planner import Feedback, Problem, Status, plan
 from slipcar.planner.codegen.traced import trace
@@ -34,6 +35,7 @@ SYSTEMS = [
     load("linear_quadratic").Docking(),
     load("free_time").Hoist(),
     load("quadrotor").Quadrotor(),
+    load("risk").Ferry(),
 ]
 
 
@@ -367,3 +369,58 @@ def test_quadrotor_with_feedback_arrives_nearer(flights):
     _, closed = simulate(problem, p, 1000, 5, feedback=Feedback(p))
     apart = [np.sqrt(np.mean((x - goal)[:, :2] ** 2)) for x in (open_loop, closed)]
     assert apart[1] < 0.2 * apart[0]
+
+
+# ------------------------------------------------------------------ risk.py
+
+
+def ferry_paths(p, *, closed, paths=40_000, seed=11):
+    """Which paths come too near, simulated here from the equation that Ferry's docstring states."""
+    rng = np.random.default_rng(seed)
+    ferry, dt = p.problem, 0.5
+    x, hit, effort = np.zeros((paths, 4)), np.zeros(paths, dtype=bool), np.zeros(paths)
+    for k in range(40):
+        u = np.broadcast_to(p.controls[k], (paths, 2))
+        if closed:
+            u = np.clip(u + (x - p.mean[k]) @ p.gains[k].T, -0.6, 0.6)
+        effort += dt * (u * u).sum(axis=1)
+        gust = 0.05 * np.sqrt(dt) * rng.standard_normal((paths, 2))
+        velocity = x[:, 2:]
+        x = np.concatenate(
+            [x[:, :2] + dt * velocity, velocity + dt * (u - 0.1 * velocity) + gust], 1
+        )
+        hit |= np.hypot(*(x[:, :2] - ferry.lightship).T) < ferry.safe
+    return hit.mean(), effort.mean(), x
+
+
+@pytest.mark.parametrize("delta", [0.05, 0.01])
+def test_ferry_keeps_its_risk_within_exact_bounds(delta):
+    # Linear with isotropic gusts: the distance at a node is a Rice variable, its law exact.
+    ferry = load("risk").Ferry()
+    p = plan(ferry, risk=delta)
+    assert p.status is Status.CONVERGED
+    s = np.sqrt(p.covariance[2:, 0, 0])  # the gusts take two steps to be felt
+    near = np.linalg.norm(p.mean[2:, :2] - ferry.lightship, axis=1)
+    with np.errstate(over="ignore"):
+        node = rice.cdf(ferry.safe / s, near / s)
+    rate, effort, _ = ferry_paths(p, closed=False)
+    noise = 4.0 * np.sqrt(delta / 40_000)
+    assert node.max() - noise <= rate <= min(node.sum(), delta) + noise
+    # A half plane holds the disc; Boole's bound of half planes is what was minimised.
+    assert node.sum() <= p.risk.predicted <= 3.0 * delta
+    assert 0.5 * delta < p.risk.verified <= delta
+    assert effort == pytest.approx(p.effort)
+
+
+def test_ferry_that_corrects_itself_passes_nearer_for_less():
+    ferry = load("risk").Ferry()
+    still, steered = plan(ferry, risk=0.01), plan(ferry, feedback=True, risk=0.01)
+    rate, effort, x = ferry_paths(steered, closed=True)
+    assert rate <= 0.01 + 4.0 * np.sqrt(0.01 / 40_000)
+    expected = steered.expected
+    assert effort == pytest.approx(expected.effort + expected.feedback, rel=0.01)
+    missed = (x - ferry.goal) ** 2 @ ferry.terminal_weight
+    assert missed.mean() == pytest.approx(expected.goal, rel=0.03)
+    assert effort < 0.9 * still.effort
+    near = [np.linalg.norm(p.mean[:, :2] - ferry.lightship, axis=1).min() for p in (still, steered)]
+    assert near[1] < near[0] - 1.0

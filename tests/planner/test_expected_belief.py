@@ -290,9 +290,7 @@ def test_bounds_leave_room_for_the_correction():
         stakes = stakes_of(ready, terminal=terminal)
         stakes = dataclasses.replace(stakes, saturation=saturation)
         now = belief.propagate(model, functions, at, stakes, zero, None, 1.0)
-        spread = np.sqrt(
-            np.einsum("kmi,kij,kmj->km", now.gains, now.covariance[:-1], now.gains)
-        )
+        spread = np.sqrt(np.einsum("kmi,kij,kmj->km", now.gains, now.covariance[:-1], now.gains))
         width = model.upper - model.lower
         margin = np.minimum(saturation * spread, 0.45 * width)
         np.testing.assert_allclose(now.upper, model.upper - margin, rtol=1e-12)

@@ -435,13 +435,24 @@ def test_compiled_steps_are_those_of_numpy_in_random_worlds(seed):
 @needs_numba
 @pytest.mark.parametrize("kind", KINDS)
 def test_compiled_steps_are_those_of_numpy_for_a_traced_problem(kind):
-    for bounds in (None, np.array([2.5, 2.0])):
-        problem = mass(bounds=bounds)
-        start = nominal(problem)
-        asked = {"start": start, "tolerance": 1e-8, **KINDS[kind]}
-        _, _, slow = settle(problem, **asked)
-        _, _, fast = settle(problem, native=True, **asked)
-        _same(fast, slow, atol=1e-7)
+    problem = mass()
+    start = nominal(problem)
+    asked = {"start": start, "tolerance": 1e-8, **KINDS[kind]}
+    _, _, slow = settle(problem, **asked)
+    _, _, fast = settle(problem, native=True, **asked)
+    _same(fast, slow, atol=1e-7)
+
+
+@needs_numba
+@pytest.mark.parametrize("feedback", [False, True])
+def test_compiled_steps_are_those_of_numpy_at_bounds(feedback):
+    asked = {"soft": True, "feedback": feedback, "price": 1.0, "terminal": 30.0, "tolerance": 1e-8}
+    _, _, free = settle(mass(), **asked)
+    problem = mass(bounds=0.9 * np.abs(free.u).max(axis=0))
+    asked["start"] = nominal(problem)
+    _, _, slow = settle(problem, **asked)
+    _, _, fast = settle(problem, native=True, **asked)
+    _same(fast, slow, atol=1e-7)
 
 
 def test_a_warm_start_at_a_solution_stays_there(paper):

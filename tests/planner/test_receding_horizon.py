@@ -145,7 +145,7 @@ def test_replanning_beats_the_open_loop_on_the_same_paths(controller, paper):
 def test_a_price_of_risk_keeps_margins(paper):
     clearance = []
     for price in (0.0, 100.0):
-        m = rollout(RecedingHorizon(paper, risk_price=price), paper, 256, seed=4).metrics
+        m = rollout(RecedingHorizon(paper, risk_price=price), paper, 128, seed=4).metrics
         clearance.append(np.quantile(m.clearance, 0.05))
     assert clearance[1] > clearance[0] + 0.01
 
