@@ -11,8 +11,7 @@ from report import Section
 from slipcar.envs import Scenario
 from slipcar.evaluation import Controller, evaluate
 from slipcar.evaluation.metrics import Result
-from slipcar.planner import Feedback, OpenLoop, Plan, plan
-from slipcar.planner.receding_horizon import RecedingHorizon
+from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
 
 #: Fresh paths of plans, and of receding horizons, which plan at each step.
 EPISODES, RECEDING_EPISODES = 100_000, 10_000

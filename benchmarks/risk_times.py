@@ -18,8 +18,7 @@ from turns import Timing, take_turns
 
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
-from slipcar.planner import Status, plan
-from slipcar.planner.receding_horizon import RecedingHorizon
+from slipcar.planner import RecedingHorizon, Status, plan
 
 #: Price of risk of the rows that have one [cost per unit of probability].
 PRICE = 10.0

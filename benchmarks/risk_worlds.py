@@ -172,7 +172,7 @@ def _plans(scenario: Scenario, risk_episodes: int) -> Iterator[tuple[str, Plan, 
 
 def _receding(scenario: Scenario, price: float) -> Iterator[tuple[str, Plan, Controller]]:
     """Receding horizons, the one with margins if there is a price."""
-    from slipcar.planner.receding_horizon import RecedingHorizon
+    from slipcar.planner import RecedingHorizon
 
     controller = RecedingHorizon(scenario)
     yield RECEDING, controller.plan, controller

@@ -215,7 +215,7 @@ def undominated(rates: np.ndarray, costs: np.ndarray) -> np.ndarray:
     """Which points are on the Pareto front: no other is as good in both and better in one.
 
     Args:
-        rates: (n,) of numbers to be small; nan is dominated.
+        rates: (n,) of numbers to be small; nan is not on the front and dominates nothing.
         costs: (n,) likewise.
 
     Returns:
@@ -248,7 +248,8 @@ class Frontier:
         """One row a point, raw numbers in SI units.
 
         `effort_front` and `total_front` say whether no other row has at most the same collision
-        rate and cost and less of one: the Pareto fronts, of estimates.
+        rate and cost and less of one: the Pareto fronts, of estimates. Rows over fewer paths than
+        the others are left out of it: luck decides more of theirs.
         """
         import pandas as pd
 
@@ -262,8 +263,11 @@ class Frontier:
             found[point.name] = row
         frame = pd.DataFrame.from_dict(found, orient="index").rename_axis("controller")
         for cost in ("effort", "total"):
-            found_any = cost in frame  # not if all rows raised
-            frame[f"{cost}_front"] = found_any and undominated(frame["collision_rate"], frame[cost])
+            frame[f"{cost}_front"] = False
+            if cost in frame:  # not if all rows raised
+                same = frame["episodes"] == self.comparison.episodes
+                rates, costs = frame["collision_rate"].where(same), frame[cost].where(same)
+                frame[f"{cost}_front"] = undominated(rates, costs)
         return frame
 
     def to_markdown(self) -> str:

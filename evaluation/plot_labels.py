@@ -151,7 +151,7 @@ class _Ground(NamedTuple):
 
     def covers(self, box: Bbox) -> bool:
         """Whether a text there would hide anything or be cut off."""
-        padded = box.padded(0.5 * self.pixels)
+        padded = box.padded(1.5 * self.pixels)
         hidden = any(_overlap(padded, other) > 0.0 for other in self.taken)
         return hidden or _within(padded, self.ink) > 0 or self._outside(box) > 0.0
 

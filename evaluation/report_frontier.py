@@ -22,7 +22,7 @@ COLUMNS = (
 TABLES: report.Captioned = [
     (
         "Collisions (Wilson 95 % interval) and cost of a path (mean ± standard error); bold: no "
-        "other row is both safer and cheaper",
+        "other row over all these paths is both safer and cheaper",
         COLUMNS,
     ),
     ("Solver failures and time (inference: 1024 episodes at once, time for one)", report.WORK),

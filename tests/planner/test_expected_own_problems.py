@@ -187,7 +187,12 @@ def test_a_problem_without_a_terminal_weight_keeps_its_end_exact():
     p = plan(problem, feedback=True)
     assert p.status.ok
     np.testing.assert_allclose(problem.terminal(p.mean[-1]), 0.0, atol=1e-6)
-    assert p.expected.goal == 0.0
+    # What is charged then is the spread alone, or feedback would have nothing to do.
+    assert p.gains.any()
+    assert p.expected.goal == pytest.approx(100.0 * np.trace(p.covariance[-1]), rel=1e-9)
+    known = lqr_gains(p.A, p.B, np.diff(p.times), np.zeros((2, 2)), np.eye(1), 100.0 * np.eye(2))
+    np.testing.assert_allclose(p.gains, known, rtol=1e-8, atol=1e-10)
+    assert plan(problem, expected=True).expected.goal == 0.0
 
 
 def test_bounds_of_one_sign_hold_with_feedback():
