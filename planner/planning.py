@@ -123,7 +123,7 @@ def plan(
             (Boole's bound; optimal risk allocation). No Monte Carlo: milliseconds.
         risk_episodes: fresh paths that verify a risk, ≥ 100.
         feedback: plan u = ū + K (x − μ) with the gains that minimise the expected cost: effort
-            of the corrections included, bounds kept at two standard deviations of them.
+            of the corrections included, bounds kept at a standard deviation of them.
             `Feedback(plan)` plays it.
         expected: charge the penalties' expectation, E Σ w max(0, c)² for Gaussian states, instead
             of their value at the mean. With `risk`, `risk_price` and `feedback` it always is.

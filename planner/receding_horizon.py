@@ -117,7 +117,7 @@ class RecedingHorizon(OpenLoop):
         risk_price: float = 0.0,
         iterations: int = 2,
         tolerance: float = 1e-3,
-        saturation: float = 2.0,
+        saturation: float = 1.0,
         workers: int = 1,
         compiled: bool | None = None,
         handover: int | None = None,

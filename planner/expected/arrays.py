@@ -15,8 +15,7 @@ from slipcar.planner.expected.losses import DENSITY, EDGE, EDGE_DENSITY, EDGE_VA
 from slipcar.planner.newton.iterate_arrays import (
     add_curvature,
     congruence,
-    covariance,
-    noise_cost,
+    noise_cost_at,
     semidefinite,
 )
 from slipcar.planner.newton.native import call
@@ -114,6 +113,43 @@ def deviations(C, Sigma, s):
 
 
 @numba.njit(error_model="numpy")
+def covariance(closed, sigma, d_sigma, dt, Sigma):
+    """`belief._covariance`."""
+    K, n, d = sigma.shape
+    scratch, noise = np.empty((n, n)), np.empty((n, n))
+    Sigma[0] = 0.0
+    for k in range(K):
+        noise[:] = 0.0
+        for a in range(d):
+            for i in range(n):
+                for j in range(n):
+                    noise[i, j] += sigma[k, i, a] * sigma[k, j, a]
+            # Σ of the states that σ depends on adds to the noise: σ′ Σ σ′ᵀ.
+            for i in range(n):
+                for y in range(n):
+                    b = d_sigma[k, i, a, y]
+                    if b != 0.0:
+                        for z in range(n):
+                            c = b * Sigma[k, y, z]
+                            if c != 0.0:
+                                for j in range(n):
+                                    noise[i, j] += c * d_sigma[k, j, a, z]
+        scratch[:] = 0.0
+        for i in range(n):
+            for v in range(n):
+                b = closed[k, i, v]
+                if b != 0.0:
+                    for j in range(n):
+                        scratch[i, j] += b * Sigma[k, v, j]
+        for i in range(n):
+            for j in range(n):
+                value = dt[k] * noise[i, j]
+                for v in range(n):
+                    value += scratch[i, v] * closed[k, j, v]
+                Sigma[k + 1, i, j] = value
+
+
+@numba.njit(error_model="numpy")
 def close_loop(A, B, gains, closed):
     """A + BK."""
     K, n, m = B.shape
@@ -171,7 +207,7 @@ def propagate(
     K, n, m = B.shape
     p = C.shape[1]
     close_loop(A, B, gains, closed)
-    covariance(closed, sigma, dt, Sigma)
+    covariance(closed, sigma, d_sigma, dt, Sigma)
     deviations(C, Sigma, s)
     charged = weight > 0.0
     row_hessians(addresses, parameters, times, at[14], charged, bend)
@@ -196,6 +232,7 @@ def propagate(
     for k in range(K, -1, -1):
         # P at node k + 1 is in P[k]; here node k's is made, or, at first, the last node's.
         if k < K:
+            noise_cost_at(dt[k], P[k], sigma[k], d_sigma[k], vg[k], vh[k])
             if feedback:
                 optimal_gain(A[k], B[k], P[k], R, dt[k], gains[k])
                 for i in range(n):
@@ -236,6 +273,9 @@ def propagate(
                             D[i, j] += b * G[v, j]
         else:
             congruence(closed[k], P[k], PA, D)
+            for i in range(n):
+                for j in range(n):
+                    D[i, j] += 0.5 * vh[k, i, j]
             if feedback:
                 for a in range(m):
                     for b in range(m):
@@ -248,10 +288,9 @@ def propagate(
             for j in range(n):
                 P[k - 1, i, j] = 0.5 * (D[i, j] + D[j, i])
     if feedback:
-        covariance(closed, sigma, dt, Sigma)
+        covariance(closed, sigma, d_sigma, dt, Sigma)
         deviations(C, Sigma, s)
         expectations(bend, Sigma, charged, offset)
-    noise_cost(1.0, P, sigma, d_sigma, dt, vg, vh)
     for k in range(K):
         for i in range(m):
             spread = 0.0

@@ -2,11 +2,12 @@
 
 With rows' derivatives by variance η and J the quadratic in deviations that follows from them,
 
-    Σ_{k+1} = (A + BK)_k Σ_k (A + BK)_kᵀ + dt σ_k σ_kᵀ
-    P_k = D_k + K_kᵀ dt R K_k + (A + BK)_kᵀ P_{k+1} (A + BK)_k
+    Σ_{k+1} = (A + BK)_k Σ_k (A + BK)_kᵀ + dt (σ_k σ_kᵀ + Σ_d σ′_kd Σ_k σ′_kdᵀ)
+    P_k = D_k + K_kᵀ dt R K_k + (A + BK)_kᵀ P_{k+1} (A + BK)_k + dt Σ_d σ′_kdᵀ P_{k+1} σ′_kd
     D_k = dt w I + ½ dt H_xx + Σ_o η_ko C_ko C_koᵀ,   D_N with GᵀWG
     K_k = −(dt R + BᵀP_{k+1}B)⁻¹ BᵀP_{k+1}A            (K = 0 in open loop)
 
+(column d of σ linearised, σ_d + σ′_d δx: under feedback the states it depends on are noisy too)
 the expected cost is that of the mean plus Σ_k dt tr(P_{k+1} σ_k σ_kᵀ), and P is its derivative by
 the noise that arrives at a node. Rows are Gaussian with the expectation c(μ) + ½ tr(∂²c Σ) and
 the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more distance than its mean does.
@@ -129,7 +130,15 @@ def _expectations(bend: Array, S: Array) -> Array:
 
 
 def _covariance(model: Model, at: Iterate, gains: Array) -> Array:
-    return moments.covariance(at.lin.A + at.lin.B @ gains, at.lin.sigma, model.dt)
+    lin, dt = at.lin, model.dt
+    closed = lin.A + lin.B @ gains
+    noise = lin.sigma @ lin.sigma.swapaxes(1, 2)
+    by_column = at.d_sigma.swapaxes(1, 2)  # (K, d, n, n)
+    S = np.zeros((len(dt) + 1, *lin.A.shape[1:]))
+    for k in range(len(dt)):
+        spread = (by_column[k] @ S[k] @ by_column[k].swapaxes(1, 2)).sum(axis=0)
+        S[k + 1] = closed[k] @ S[k] @ closed[k].T + dt[k] * (noise[k] + spread)
+    return S
 
 
 def _weights(model: Model, at: Iterate, stakes: Stakes, held: Array) -> tuple[Array, Array]:
@@ -144,6 +153,7 @@ def _weights(model: Model, at: Iterate, stakes: Stakes, held: Array) -> tuple[Ar
     gains = np.zeros((K, lin.u.shape[1], n))
     P = np.empty((K, n, n))
     P[-1] = D[-1]
+    by_column = at.d_sigma.swapaxes(1, 2)  # (K, d, n, n)
     for k in range(K - 1, -1, -1):
         A, B = lin.A[k], lin.B[k]
         closed = A
@@ -153,6 +163,7 @@ def _weights(model: Model, at: Iterate, stakes: Stakes, held: Array) -> tuple[Ar
             closed = A + B @ gains[k]
         if k:
             P[k - 1] = D[k - 1] + closed.T @ P[k] @ closed
+            P[k - 1] += dt[k] * (by_column[k].swapaxes(1, 2) @ P[k] @ by_column[k]).sum(axis=0)
             if stakes.feedback:
                 P[k - 1] += dt[k] * gains[k].T @ model.R @ gains[k]
     return P, gains

@@ -44,6 +44,17 @@ def _consistent(at, soft, tuning):
 
 
 @numba.njit(error_model="numpy")
+def _confined(u, lower, upper, inside):
+    """`loop._confined`: u within bounds, into `inside`; whether that is another."""
+    moved = False
+    for k in range(u.shape[0]):
+        for i in range(u.shape[1]):
+            inside[k, i] = min(max(u[k, i], lower[k, i]), upper[k, i])
+            moved = moved or inside[k, i] != u[k, i]
+    return moved
+
+
+@numba.njit(error_model="numpy")
 def _iterate(
     addresses, parameters, times, R, lower, upper, weight, tail, W, soft, feedback, w, saturation,
     damping, tolerance, max_iterations, tuning, warm, d, x, u, gains, held, adjoint, nu, A_out,
@@ -93,9 +104,14 @@ def _iterate(
         if gramian > 0.0:
             kappa = tuning.terminal_curvature * q_ / gramian
         seen = gramian / (1.0 + kappa * gramian)
+    first = at[19][0]
     shift, floor, last, shortest, stale = 0.0, 0.0, np.inf, np.inf, 0
     rejected, tried, status = 0, 0, MAX_ITERATIONS
     for _ in range(max_iterations):
+        if _confined(at[15], low_bound, high_bound, new[15]):
+            new[14][:] = at[14]
+            if evaluate(addresses, parameters, times, dt, R, none, 0.0, new):
+                at, new = new, at
         A, B, f, xs, us = at[1], at[2], at[16], at[14], at[15]
         G, g = (no_G, no_g) if soft else (at[13], at[12])
         fill_losses(dt, weight, tail, at[7], offset, s, slope, curvature)
@@ -148,7 +164,7 @@ def _iterate(
         before = here + value + factor * lacking
         predicted = gained + factor * lacking
         noise = tuning.noise * (1.0 + abs(before))
-        most = tuning.longest * (at[19][0] + 1e-3 * length)
+        most = tuning.longest * (max(first, at[19][0]) + 1e-3 * length)
         alpha = 1.0 if length <= most else np.sqrt(most / length)
         accepted, actual = False, -np.inf
         for trial in range(tuning.searches):

@@ -6,8 +6,9 @@ One LQ problem per iteration, as in :mod:`slipcar.planner.newton.loop`, of
 
 with the rows' standard deviations s and the adjoint weights P of the iterate (:mod:`.belief`);
 after each step they are computed anew, and with them the gains. Its fixed points are stationary
-points of the expected cost in controls and gains, to second order in the noise. The way there is
-linear, with a factor of some tenths. Curvature of dynamics and rows is in the model; inertia,
+points of the expected cost in controls and gains but for what :mod:`.belief` names as neglected
+(nothing, where dynamics and rows are affine). The way there is linear, with a factor of some
+tenths. Curvature of dynamics and rows is in the model; inertia,
 shift and line search are those of `newton.loop`.
 """
 
@@ -49,7 +50,8 @@ class Steered:
         terminal: ν, (q,); 2Wg where the terminal condition is charged.
         effort: Σ dt uᵀRu.
         running: Σ dt (H + ℓᵀu).
-        objective: the expected cost.
+        objective: the cost of the last step, P held: the mean's, plus what the noise is charged;
+            rows' spread is in both. `field.value` is the expected cost.
         iterations: steps tried.
     """
 
@@ -100,6 +102,7 @@ def iterate(
     belief = propagate(
         model, functions, at, stakes, gains, held, damping if warm is not None else 1.0
     )
+    first = at.lin.effort
     unit = float(np.max(np.diag(model.R)))
     shift, last, rejected, tried = 0.0, np.inf, 0, 0
     solver = LqSolver(K, n, m, 0 if stakes.soft else q)
@@ -110,6 +113,7 @@ def iterate(
     bounds = (np.zeros(u.shape, dtype=bool), np.zeros(u.shape, dtype=bool))
     status = Status.MAX_ITERATIONS
     for _ in range(max_iterations):
+        at = _confined(model, functions, at, belief)
         quadratic = _quadratic(model, functions, stakes, at, belief, adjoint, terminal)
         found = None
         for _ in range(tuning.inertia_trials):
@@ -123,7 +127,7 @@ def iterate(
             status = Status.SOLVER_FAILED
             break
         tried += 1
-        step = _search(model, functions, stakes, at, belief, quadratic, found, tuning)
+        step = _search(model, functions, stakes, at, belief, quadratic, found, first, tuning)
         if not step.accepted:
             rejected += 1
             shift = max(tuning.shift_up * shift, 0.1 * tuning.first_shift * unit)
@@ -160,6 +164,19 @@ def iterate(
         terminal=terminal, effort=lin.effort, running=lin.running,
         objective=value, iterations=tried,
     )  # fmt: skip
+
+
+def _confined(model: Model, functions: Functions, at: Iterate, belief: Belief) -> Iterate:
+    """With controls within the bounds that the gains of now leave.
+
+    Bounds follow the gains, so that the last step's controls may lie outside: a step back costs
+    more than it gains, and measured from there none would be accepted.
+    """
+    u = np.clip(at.lin.u, belief.lower, belief.upper)
+    if np.array_equal(u, at.lin.u):
+        return at
+    moved = evaluate(model, functions, 0.0, at.lin.x, u)
+    return moved if moved.finite else at
 
 
 def _cost(model: Model, stakes: Stakes, at: Iterate, belief: Belief) -> float:
@@ -287,9 +304,13 @@ def _search(
     belief: Belief,
     quadratic: Quadratic,
     found: LqSolution,
+    first: float,
     tuning: Tuning,
 ) -> _Step:
-    """Shorten the step until the held cost, with what is lacking priced, falls."""
+    """Shorten the step until the held cost, with what is lacking priced, falls.
+
+    `first` is the effort of the guess, which says what a long step is.
+    """
     lin, d = at.lin, found.d
     e = np.clip(found.e, belief.lower - lin.u, belief.upper - lin.u)
     change = float(np.vdot(quadratic.q + 0.5 * times(quadratic.Q, d), d))
@@ -314,7 +335,7 @@ def _search(
     noise = tuning.noise * (1.0 + abs(before))
     # Rows and dynamics are far from their models beyond some length of a step.
     length = float(np.vdot(model.dt[:, None] * e, e @ model.R))
-    most = tuning.longest * (lin.effort + 1e-3 * length)
+    most = tuning.longest * (max(first, lin.effort) + 1e-3 * length)
     alpha = 1.0 if length <= most else float(np.sqrt(most / length))
     for trial in range(tuning.searches):
         x = lin.x.copy()

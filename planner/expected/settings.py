@@ -23,7 +23,7 @@ class Tuning(NamedTuple):
         patience: of steps in a row, none shorter than half the shortest before them: then they go
             round in circles, and both damping and shift are made to shorten them.
         least_damping: how far that goes.
-        longest: a step ∫ΔuᵀRΔu dt at most, relative to the effort.
+        longest: a step ∫ΔuᵀRΔu dt at most, relative to the effort, or the guess's if larger.
         noise: relative accuracy of the merit function.
         feasibility: what a converged plan may leave of the terminal condition, per unit of state.
         consistency: and between its mean and the path its controls lead to.

@@ -33,5 +33,5 @@ class Stakes:
     soft: bool
     feedback: bool
     variance_weight: float
-    saturation: float = 2.0
+    saturation: float = 1.0
     damping: float = 0.5

@@ -134,30 +134,37 @@ def congruence(A, P, PA, out):
 @numba.njit(error_model="numpy")
 def noise_cost(w, P, sigma, d_sigma, dt, gradient, hessian):
     """The cost w Σ dt tr(P σσᵀ), and its gradient and Hessian by the states, σ linearised."""
-    K, n, d = sigma.shape
+    value = 0.0
+    for k in range(len(sigma)):
+        value += noise_cost_at(w * dt[k], P[k], sigma[k], d_sigma[k], gradient[k], hessian[k])
+    return value
+
+
+@numba.njit(error_model="numpy")
+def noise_cost_at(scale, P, sigma, d_sigma, gradient, hessian):
+    """The same of one node."""
+    n, d = sigma.shape
     value = 0.0
     weighted = np.empty((n, d))
-    for k in range(K):
-        scale = w * dt[k]
-        gradient[k] = 0.0
-        hessian[k] = 0.0
-        for a in range(d):
-            for i in range(n):
-                total = 0.0
-                for v in range(n):
-                    total += P[k, i, v] * sigma[k, v, a]
-                weighted[i, a] = scale * total
-                value += weighted[i, a] * sigma[k, i, a]
-            for i in range(n):
-                for y in range(n):
-                    slope = d_sigma[k, i, a, y]
-                    if slope != 0.0:
-                        gradient[k, y] += 2.0 * weighted[i, a] * slope
-                        for v in range(n):
-                            share = 2.0 * scale * P[k, i, v] * slope
-                            if share != 0.0:
-                                for z in range(n):
-                                    hessian[k, y, z] += share * d_sigma[k, v, a, z]
+    gradient[:] = 0.0
+    hessian[:] = 0.0
+    for a in range(d):
+        for i in range(n):
+            total = 0.0
+            for v in range(n):
+                total += P[i, v] * sigma[v, a]
+            weighted[i, a] = scale * total
+            value += weighted[i, a] * sigma[i, a]
+        for i in range(n):
+            for y in range(n):
+                slope = d_sigma[i, a, y]
+                if slope != 0.0:
+                    gradient[y] += 2.0 * weighted[i, a] * slope
+                    for v in range(n):
+                        share = 2.0 * scale * P[i, v] * slope
+                        if share != 0.0:
+                            for z in range(n):
+                                hessian[y, z] += share * d_sigma[v, a, z]
     return value
 
 

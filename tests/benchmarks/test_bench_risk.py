@@ -1,4 +1,4 @@
-"""The benchmarks of risk: promises counted on fresh paths, ratios over common ones, honest words."""
+"""The benchmarks of risk: promises counted on fresh paths, ratios over common ones, honest rows."""
 
 import dataclasses
 import importlib
@@ -164,7 +164,7 @@ def test_monte_carlo_is_not_in_the_time(bench):
     assert skipped == {}
     seconds, answer = risky.solve()
     assert answer.found
-    assert 0.0 < seconds
+    assert seconds > 0.0
     (monte_carlo,) = simulated["risk=0.01, starts=1"]
     assert monte_carlo > 0.0
     base.solve()

@@ -119,9 +119,11 @@ def test_default_rows(paper, replay):
     assert safer["effort"] > cheaper["effort"]
 
 
-def test_default_rows_speak_of_plans_that_failed(paper, replay):
-    # Nearly four metres in half a second: not within these bounds.
-    hopeless = paper.replace(horizon=0.5)
-    _, notes = default_rows(hopeless, policy=replay(hopeless, (0.0, 0.0)))
-    assert len(notes) >= 1
-    assert "the plan is" in notes[0]
+def test_default_rows_speak_of_plans_that_failed(paper, replay, monkeypatch):
+    unfinished = plan(paper, max_iterations=1)
+    monkeypatch.setattr("slipcar.evaluation.rows.plan", lambda scenario, **options: unfinished)
+    rows, notes = default_rows(paper, policy=replay(paper, (0.0, 0.0)))
+    for name in (STOCHASTIC, CHANCE, STEERED, STEERED_CHANCE):
+        assert any(note.startswith(f"{name}: the plan is MAX_ITERATIONS") for note in notes)
+        assert solver_failures(rows[name]) == 1
+    assert len(notes) == 4
