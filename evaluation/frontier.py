@@ -25,8 +25,7 @@ from slipcar.envs.validate import checked_int
 from slipcar.evaluation import rows
 from slipcar.evaluation.compare import Comparison, compare
 from slipcar.evaluation.rollout import Controller, check_counts
-from slipcar.planner import Feedback, OpenLoop, plan
-from slipcar.planner.receding_horizon import RecedingHorizon
+from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan
 
 if TYPE_CHECKING:
     import pandas as pd

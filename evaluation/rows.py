@@ -5,8 +5,7 @@ from __future__ import annotations
 from slipcar import baselines
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.rollout import Controller
-from slipcar.planner import Feedback, OpenLoop, Plan, plan
-from slipcar.planner.receding_horizon import RecedingHorizon
+from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
 
 STRAIGHT = "straight (ignores obstacles)"
 DETERMINISTIC = "deterministic SCP"

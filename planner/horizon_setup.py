@@ -29,7 +29,7 @@ Array = np.ndarray
 def stakes_of(problem: Any, risk_price: float, saturation: float) -> Stakes:
     """What every replan is charged: what a plan with feedback is."""
     ready = posed(problem)
-    if risk_price > 0.0 and not ready.guarded.is_constraint.any():
+    if risk_price > 0.0 and getattr(problem, "constraint", None) is None:
         raise ValueError(
             f"risk_price={risk_price:g} needs a problem with constraint(t, x) -> (..., p), "
             f"violated where > 0, which {type(problem).__name__} has not"

@@ -46,6 +46,6 @@ def test_table_is_what_the_command_prints(tmp_path):
     assert main(["compare", "--no-figures", "--folder", str(tmp_path)]) == 0
     printed = (tmp_path / "table.md").read_text(encoding="utf-8").split("**Paired")[0]
     rows = [line for line in printed.splitlines() if line.startswith("| ")]
-    assert len(rows) == 6
+    assert len(rows) == 11
     text = README.read_text(encoding="utf-8")
     assert [row for row in rows if row not in text] == []
