@@ -6,6 +6,8 @@
 PYTHON ?= python3
 # Passed on to the command: make compare ARGS="--episodes 1000", make test ARGS="-k scenario"
 ARGS ?=
+# Processes that share the episodes of `compare` and `frontier`; the numbers do not depend on it.
+WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 1)
 # Options of pip for torch alone, say --index-url with the address of a CPU-only build.
 TORCH_ARGS ?=
 
@@ -40,7 +42,7 @@ help:  ## list the targets
 install: $(INSTALLED)  ## set up .venv (every other target does it when needed)
 
 compare: $(INSTALLED)  ## the main job: SCP, feedback and PPO over the same noise; results/compare
-	$(BIN)/slipcar compare $(ARGS)
+	$(BIN)/slipcar compare --workers $(WORKERS) $(ARGS)
 
 test: $(INSTALLED)  ## all tests but the long ones
 	$(BIN)/python -m pytest $(ARGS)
@@ -49,7 +51,7 @@ test-long: $(INSTALLED)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m long $(ARGS)
 
 frontier: $(INSTALLED)  ## what safety costs: effort against collision rate; results/frontier
-	$(BIN)/slipcar frontier $(ARGS)
+	$(BIN)/slipcar frontier --workers $(WORKERS) $(ARGS)
 
 train: $(INSTALLED)  ## train the PPO baseline; runs/ppo
 	$(BIN)/slipcar train $(ARGS)

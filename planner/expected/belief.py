@@ -14,7 +14,7 @@ the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more distance than it
 
 Held while a step is computed, P makes the noise a cost of the deterministic states σ depends on:
 the sensitivity of every later Σ is in it. That η and K would follow is of second order at a
-solution, where K is optimal. What is neglected is how ∂b/∂x, C and ½ tr(∂²c Σ) follow.
+solution, where K is optimal. What is neglected is how ∂b/∂x, σ′, C and ½ tr(∂²c Σ) follow.
 """
 
 from __future__ import annotations

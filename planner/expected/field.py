@@ -28,8 +28,8 @@ from slipcar.planner.records import ExpectedCost
 Array = np.ndarray
 
 #: So many candidates stay after the first price, at most, and none so many times as dear as the
-#: best.
-_KEPT, _BEHIND = 3, 2.0
+#: best. Where risk is free, the best way may be straight through: there this many times.
+_KEPT, _BEHIND, _FREE = 3, 2.0, 3.0
 
 
 def priced(stakes: Stakes, price: float) -> Stakes:
@@ -123,8 +123,9 @@ class Field:
             return None
         best = worth[order[0]][0]
         # One that fails, warm and cold, while another does not, is not tried again either.
-        near = [i for i in order if worth[i][0] <= best + (_BEHIND - 1.0) * abs(best)]
-        self._alive = near[:_KEPT]
+        behind, kept = (_BEHIND, _KEPT) if price > 0.0 else (_FREE, len(order))
+        near = [i for i in order if worth[i][0] <= best + (behind - 1.0) * abs(best)]
+        self._alive = near[:kept]
         return worth[order[0]][1]
 
     def origin(self, found: Steered) -> int:

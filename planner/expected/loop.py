@@ -7,9 +7,9 @@ One LQ problem per iteration, as in :mod:`slipcar.planner.newton.loop`, of
 with the rows' standard deviations s and the adjoint weights P of the iterate (:mod:`.belief`);
 after each step they are computed anew, and with them the gains. Its fixed points are stationary
 points of the expected cost in controls and gains but for what :mod:`.belief` names as neglected
-(nothing, where dynamics and rows are affine). The way there is linear, with a factor of some
-tenths. Curvature of dynamics and rows is in the model; inertia,
-shift and line search are those of `newton.loop`.
+(nothing, where dynamics, σ and rows are affine). The way there is linear, with a factor of some
+tenths. Curvature of dynamics and rows is in the model; inertia, shift and line search are those of
+`newton.loop`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The paper's case with its reference, and tools that know the dynamics but not the planner."""
 
 import json
+import types
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,10 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import plan
+from slipcar.planner.expected import loop
+from slipcar.planner.expected.field import priced
+from slipcar.planner.expected.guarded import posed
+from slipcar.planner.expected.stakes import Stakes
 
 
 @pytest.fixture(scope="session")
@@ -55,3 +60,102 @@ def cost_of_controls():
         return effort + np.einsum("k,p,kp", dt, problem.penalty_weight, c**2)
 
     return cost
+
+
+# ------------------------------------------------------------------------------ expected costs
+
+
+def _stakes_of(ready, *, price, soft, feedback, terminal=None, w=0.0, damping=0.5):
+    """What to charge; the end at 100, or at `terminal`, if it is charged at all."""
+    guarded = ready.guarded
+    q = len(ready.model.terminal(ready.model.start))
+    given = 100.0 if soft or feedback else 0.0
+    stakes = Stakes(
+        weight=guarded.penalty_weight,
+        tail=guarded.is_constraint,
+        terminal=np.full(q, given if terminal is None else terminal),
+        soft=soft,
+        feedback=feedback,
+        variance_weight=w,
+        damping=damping,
+    )
+    return priced(stakes, price)
+
+
+def _nominal(problem):
+    """A plan of the mean, where the iteration begins."""
+    found = plan(problem, variance_weight=0.0, compiled=False)
+    return found.mean, found.controls
+
+
+def _settle(problem, *, native=False, start=None, warm=None, tolerance=1e-14, limit=300, **asked):
+    """(posed problem, stakes, answer)."""
+    ready = posed(problem)
+    stakes = _stakes_of(ready, **asked)
+    x, u = _nominal(problem) if start is None else start
+    functions = ready.functions(x, u, native=native)
+    iterate = loop.iterate
+    if native:
+        from slipcar.planner.expected import run
+
+        assert functions.kernels is not None, functions.reason
+        iterate = run.iterate
+    found = iterate(
+        ready.model, functions, stakes, x, u, tolerance=tolerance, max_iterations=limit, warm=warm
+    )
+    return ready, stakes, found
+
+
+def _mass(*, bounds=None, slip=0.4, walls=True, curved=True, additive=0.05, nodes=13):
+    """A point mass (p, v) whose noise grows with its speed, between affine rows, unevenly timed."""
+    shape = np.diag([0.2, 0.1, 0.4, 0.3]) + 0.05
+    gaps = 0.1 * (1.0 + 0.3 * np.sin(3.0 * np.arange(nodes - 1)))
+
+    def diffusion(t, x):
+        noise = np.zeros((*x.shape, 2), dtype=x.dtype)
+        noise[..., 0, 0], noise[..., 1, 1] = slip * x[..., 3], slip * x[..., 2]
+        noise[..., 0, 1] = additive
+        return noise
+
+    members = {
+        "start": np.array([0.0, 0.0, 0.1, -0.1]),
+        "times": np.concatenate([[0.0], np.cumsum(gaps)]),
+        "control_weight": np.array([[1.0, 0.2], [0.2, 0.6]]),
+        "drift": lambda t, x, u: np.concatenate([x[..., 2:], u], axis=-1),
+        "diffusion": diffusion,
+        "terminal": lambda x: x - np.array([1.0, 0.7, 0.0, 0.0]),
+        "control_bounds": bounds,
+    }
+    if walls:
+        members |= {
+            "penalty": lambda t, x: x[..., 1:2] - 0.8 * x[..., :1] - 0.02,
+            "penalty_weight": np.array([40.0]),
+            "constraint": lambda t, x: np.stack([x[..., 0] - 1.15, -0.1 - x[..., 1]], axis=-1),
+        }
+    if curved:
+        members["state_cost"] = lambda t, x: np.einsum("...i,ij,...j", x, shape, x)
+    return types.SimpleNamespace(**members)
+
+
+@pytest.fixture(scope="session")
+def expected_stakes():
+    """Stakes of a posed problem."""
+    return _stakes_of
+
+
+@pytest.fixture(scope="session")
+def nominal():
+    """Means and controls where the iteration on expected costs begins."""
+    return _nominal
+
+
+@pytest.fixture(scope="session")
+def settle():
+    """The iteration on expected costs, to the end: (posed problem, stakes, answer)."""
+    return _settle
+
+
+@pytest.fixture(scope="session")
+def mass():
+    """A point mass between walls, by its keywords."""
+    return _mass

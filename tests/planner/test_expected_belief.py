@@ -85,13 +85,21 @@ def settled():
     return model, stakes, at, now, shape
 
 
+def mean_square_noise(model, k, x, S):
+    """E σσᵀ where the state has mean x and covariance S: exact, as σ is affine in it."""
+    t = model.times[k]
+    sigma = model.diffusion(t, x)
+    slopes = np.array([model.diffusion(t, x + e) - sigma for e in np.eye(N)])
+    return sigma @ sigma.T + np.einsum("iad,ij,jbd->ab", slopes, S, slopes)
+
+
 def closed_covariance(at, model, gains, extra=None):
     """Σ by the recursion written out; `extra` (K, n, n) is injected on arrival."""
     lin = at.lin
     S = [np.zeros((N, N))]
     for k, dt in enumerate(model.dt):
         F = lin.A[k] + lin.B[k] @ gains[k]
-        arrives = dt * lin.sigma[k] @ lin.sigma[k].T
+        arrives = dt * mean_square_noise(model, k, lin.x[k], S[k])
         S.append(F @ S[k] @ F.T + arrives + (0.0 if extra is None else extra[k]))
     return np.array(S)
 
@@ -119,16 +127,30 @@ def whole_cost(model, stakes, at, gains, shape, extra=None):
     return rows + held_cost(model, stakes, at, none, gains, shape, extra)
 
 
+def kicks(rng, model, at, k, e):
+    """What noise adds on the way from node k: its strength is that where each path is, (P, n)."""
+    sigma = model.diffusion(model.times[k], at.lin.x[k] + e)
+    drawn = rng.standard_normal((len(e), sigma.shape[-1]))
+    return np.sqrt(model.dt[k]) * np.einsum("eid,ed->ei", sigma, drawn)
+
+
 def test_the_covariance_is_that_of_simulated_deviations(settled):
     model, _, at, now, _ = settled
     rng, paths = np.random.default_rng(0), 200_000
     e = np.zeros((paths, N))
+    for k in range(len(model.dt)):
+        F = at.lin.A[k] + at.lin.B[k] @ now.gains[k]
+        e = e @ F.T + kicks(rng, model, at, k, e)
+        S, squares = now.covariance[k + 1], e * e
+        # Not Gaussian any more: the standard errors are the paths' own.
+        error = np.sqrt((squares.T @ squares / paths - S**2).clip(0.0) / paths)
+        assert (np.abs(e.T @ e / paths - S) <= 5.0 * error + 1e-15).all()
+    # Without the noise of noisy states it would be another.
+    plain = np.zeros((N, N))
     for k, dt in enumerate(model.dt):
         F, sigma = at.lin.A[k] + at.lin.B[k] @ now.gains[k], at.lin.sigma[k]
-        e = e @ F.T + np.sqrt(dt) * rng.standard_normal((paths, sigma.shape[1])) @ sigma.T
-        S = now.covariance[k + 1]
-        error = np.sqrt((np.outer(np.diag(S), np.diag(S)) + S**2) / paths)
-        assert (np.abs(e.T @ e / paths - S) <= 5.0 * error + 1e-15).all()
+        plain = F @ plain @ F.T + dt * sigma @ sigma.T
+    assert (np.abs(plain - S) > 10.0 * error).any()
     # And to rounding, by the recursion itself.
     np.testing.assert_allclose(
         now.covariance, closed_covariance(at, model, now.gains), atol=1e-15, rtol=1e-12
@@ -141,7 +163,10 @@ def test_deviations_of_rows_are_those_of_the_closed_loop(settled):
 
 
 def test_weights_are_the_derivative_by_the_noise_that_arrives(settled):
-    """P at node k+1 is ∂cost/∂(noise injected there): with weights held, and of the whole."""
+    """P at node k+1 is ∂cost/∂(noise injected there): with weights held, and of the whole.
+
+    Noise that arrives makes later noise larger: that is in the derivative.
+    """
     model, stakes, at, now, shape = settled
     rng = np.random.default_rng(3)
     # At a fixed point the weights that are held are those the spread asks for.
@@ -242,7 +267,7 @@ def test_open_loop_has_no_gains_but_the_same_weights_by_differences():
 
 @pytest.mark.parametrize("w", [0.0, 0.7])
 def test_gains_of_a_linear_quadratic_problem_are_the_regulators(w):
-    problem, shape = mass(walls=False)
+    problem, shape = mass(walls=False, slip=0.0)  # additive noise: certainty equivalence
     problem.times = np.linspace(0.0, 1.5, 16)  # lqr_gains charges the interval that begins
     ready = posed(problem)
     model = ready.model
@@ -256,6 +281,40 @@ def test_gains_of_a_linear_quadratic_problem_are_the_regulators(w):
     end = np.diag(stakes.terminal) + model.dt[-1] * Q
     known = lqr_gains(at.lin.A, at.lin.B, model.dt, Q, model.R, end)
     np.testing.assert_allclose(now.gains, known, rtol=1e-10, atol=1e-12)
+
+
+def test_gains_where_noise_grows_with_the_state_are_more_than_the_regulators():
+    """One state, noise σ = b x: Riccati's recursion has b² dt P more, in closed form."""
+    b, r, w_end, K = 0.8, 2.0, 30.0, 12
+    problem = types.SimpleNamespace(
+        start=np.ones(1),
+        times=np.linspace(0.0, 1.2, K + 1),
+        control_weight=r * np.eye(1),
+        drift=lambda t, x, u: 0.3 * x + u,
+        diffusion=lambda t, x: b * x[..., None],
+        terminal=lambda x: x + 0.0,
+    )
+    ready = posed(problem)
+    model = ready.model
+    x, u = model.guess()
+    functions = ready.functions(x, u, native=False)
+    at = evaluate(model, functions, 0.0, x, u)
+    stakes = Stakes(
+        weight=np.zeros(0),
+        tail=np.zeros(0, dtype=bool),
+        terminal=np.full(1, w_end),
+        soft=True,
+        feedback=True,
+        variance_weight=0.0,
+    )
+    now = belief.propagate(model, functions, at, stakes, np.zeros((K, 1, 1)), None, 1.0)
+    P = w_end
+    for k in range(K - 1, -1, -1):
+        h = model.dt[k]
+        assert now.P[k, 0, 0] == pytest.approx(P, rel=1e-12)
+        gain = -h * P * (1.0 + 0.3 * h) / (h * r + h * h * P)
+        assert now.gains[k, 0, 0] == pytest.approx(gain, rel=1e-12)
+        P = (1.0 + h * (0.3 + gain)) ** 2 * P + h * r * gain**2 + h * b * b * P
 
 
 def test_damping_mixes_weights_of_tails_by_their_logarithms(settled):
@@ -307,9 +366,7 @@ def test_effort_of_the_feedback_is_that_of_simulated_corrections(settled):
     for k, dt in enumerate(model.dt):
         v = e @ now.gains[k].T
         efforts += dt * np.einsum("ei,ij,ej->e", v, model.R, v)
-        sigma = at.lin.sigma[k]
-        e = e @ at.lin.A[k].T + v @ at.lin.B[k].T
-        e += np.sqrt(dt) * rng.standard_normal((paths, sigma.shape[1])) @ sigma.T
+        e = e @ at.lin.A[k].T + v @ at.lin.B[k].T + kicks(rng, model, at, k, e)
     predicted = belief.feedback_effort(model, now.gains, now.covariance)
     assert abs(predicted - efforts.mean()) < 5.0 * efforts.std() / np.sqrt(paths)
     assert predicted > 0.0
