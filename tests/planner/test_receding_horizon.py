@@ -231,7 +231,7 @@ def test_it_travels_to_other_processes(controller):
 
 
 def test_fingerprint_tells_options_apart(controller, paper):
-    others = [RecedingHorizon(paper, risk_price=1.0), RecedingHorizon(paper, iterations=1)]
+    others = [RecedingHorizon(paper, risk_price=1.0), RecedingHorizon(paper, iterations=2)]
     assert len({c.fingerprint() for c in (controller, *others)}) == 3
     assert RecedingHorizon(paper).fingerprint() == controller.fingerprint()
 
