@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 PRICES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 RECEDING_PRICES = (0.0, 3.0, 10.0, 30.0)
 #: Episodes a point by default; replanning costs a thousand times what playing a plan does.
-EPISODES, RECEDING_EPISODES = 50_000, 4_096
+EPISODES, RECEDING_EPISODES = 50_000, 16_384
 #: The methods that have a curve, and the family of all others.
 OPEN_LOOP, FEEDBACK, RECEDING = "open loop", "planned feedback", "receding horizon"
 CURVES = (OPEN_LOOP, FEEDBACK, RECEDING)

@@ -104,7 +104,10 @@ def tradeoff_figure(comparison: Comparison) -> Figure:
 
 def _plain_log_ticks(axis: Any) -> None:
     """1, 2, 5, 10 … instead of powers, over the decade or two that is shown."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+    low, high = axis.get_view_interval()
+    # On more than three decades the labels of 2 and 3 would touch.
+    wide = low > 0.0 and high > 1e3 * low
+    axis.set_major_locator(LogLocator(subs=(1.0, 3.0) if wide else (1.0, 2.0, 3.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
