@@ -266,7 +266,7 @@ class Frontier:
             if cost in frame:  # not if all rows raised
                 same = frame["episodes"] == self.comparison.episodes
                 rates, costs = frame["collision_rate"].where(same), frame[cost].where(same)
-                frame[f"{cost}_front"] = undominated(rates, costs)
+                frame[f"{cost}_front"] = undominated(rates.to_numpy(), costs.to_numpy())
         return frame
 
     def to_markdown(self) -> str:

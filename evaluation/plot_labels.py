@@ -108,7 +108,7 @@ def place(
 class Place(NamedTuple):
     """Where a text might go: beside which anchor, its box [pixels], how far off [points]."""
 
-    index: int
+    which: int
     anchor: np.ndarray
     box: Bbox
     distance: float
@@ -141,7 +141,7 @@ class _Ground(NamedTuple):
         covered = sum(_overlap(box.padded(1.5 * self.pixels), other) for other in self.taken)
         crossed = _within(box.padded(2.0 * self.pixels), self.ink)
         cost = 20.0 * covered / self.pixels**2 + 30.0 * crossed + place.distance
-        cost += 3.0 * place.index
+        cost += 3.0 * place.which
         if place.distance > _LEADER:
             end = np.clip(place.anchor, box.p0, box.p1)
             way = _sampled(np.array([end, place.anchor]))
