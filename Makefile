@@ -62,7 +62,7 @@ bench: $(BENCH_INSTALLED)  ## time the planner beside its peers, environments, e
 bench-worlds: $(BENCH_INSTALLED)  ## plan for 1000 random worlds, ours and IPOPT; results/bench
 	$(BIN)/python benchmarks/run.py --only worlds $(ARGS)
 
-bench-docs: $(BENCH_INSTALLED)  ## every benchmark once more, into docs/benchmarks.md
+bench-docs: $(BENCH_INSTALLED)  ## every benchmark once more, into docs/benchmarks*.md
 	$(BIN)/python benchmarks/run.py --docs $(ARGS)
 
 lint: types  ## ruff (rules and format) and mypy

@@ -1,4 +1,4 @@
-"""docs/benchmarks.md from what the parts left behind: nothing in it is written by hand."""
+"""Pages of docs/ from what the parts left behind: nothing in them is written by hand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 import report
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGE = "benchmarks.md"
 _PREFIX = "bench-"
 
 _HOW = """\
@@ -28,13 +27,22 @@ slipcar's own dynamics, and the cost and the miss of the goal are those of that 
 belong to the machine; what carries over are ratios within a run."""
 
 
-def write(folder: Path, parts: Sequence[str], docs: Path = DOCS) -> list[Path]:
-    """Write the page and its figures; returns their paths.
+def write(
+    folder: Path,
+    parts: Sequence[str],
+    docs: Path = DOCS,
+    *,
+    name: str = "benchmarks.md",
+    title: str = "Benchmarks",
+) -> list[Path]:
+    """Write a page and its figures; returns their paths.
 
     Args:
         folder: where the parts have been measured into.
         parts: names of the sections, in order.
         docs: where the page goes.
+        name: of its file.
+        title: its heading.
 
     Raises:
         FileNotFoundError: if a part or a figure is missing in the folder.
@@ -51,11 +59,11 @@ def write(folder: Path, parts: Sequence[str], docs: Path = DOCS) -> list[Path]:
     how = "How times are taken"
     contents = [how, *(section.title for section, _ in sections)]
     lines = [
-        "# Benchmarks",
+        f"# {title}",
         "",
         "Written by `make bench-docs`; do not edit.",
         "",
-        *(f"* [{title}](#{anchor(title)})" for title in contents),
+        *(f"* [{part}](#{anchor(part)})" for part in contents),
         "",
         report.machine(first),
         "",
@@ -68,10 +76,10 @@ def write(folder: Path, parts: Sequence[str], docs: Path = DOCS) -> list[Path]:
     docs.mkdir(parents=True, exist_ok=True)
     paths = []
     for section, _ in sections:
-        for name in section.figures:
-            paths.append(docs / f"{_PREFIX}{name}.png")
-            shutil.copyfile(folder / f"{name}.png", paths[-1])
-    page = docs / PAGE
+        for figure in section.figures:
+            paths.append(docs / f"{_PREFIX}{figure}.png")
+            shutil.copyfile(folder / f"{figure}.png", paths[-1])
+    page = docs / name
     page.write_text("\n".join(lines), encoding="utf-8")
     return [page, *paths]
 

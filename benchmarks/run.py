@@ -28,6 +28,15 @@ import worlds
 PARTS = ("planners", "growth", "cold", "simulation", "risk_times")
 #: Minutes; on request.
 LONG_PARTS = ("worlds", "risk_paper", "risk")
+#: Pages of the docs: file, heading and parts.
+PAGES = (
+    ("benchmarks.md", "Benchmarks", ("planners", "growth", "cold", "simulation", "worlds")),
+    (
+        "benchmarks-risk.md",
+        "Benchmarks: risk, feedback, receding horizon",
+        ("risk_paper", "risk_times", "risk"),
+    ),
+)
 
 
 def main() -> None:
@@ -50,8 +59,10 @@ def main() -> None:
         print(report.markdown(section, told))
         written = report.save(folder, section, told)
         print(f"written: {', '.join(map(str, written))} ({time.perf_counter() - began:.0f} s)\n")
-    if arguments.docs:
-        print(f"written: {', '.join(map(str, page.write(folder, PARTS + LONG_PARTS)))}")
+    for name, title, parts in PAGES if arguments.docs else ():
+        if set(parts) & set(arguments.only):
+            pages = page.write(folder, parts, name=name, title=title)
+            print(f"written: {', '.join(map(str, pages))}")
 
 
 def _arguments() -> argparse.Namespace:
@@ -65,7 +76,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--docs",
         action="store_true",
-        help="write docs/benchmarks.md, from this run and the parts already in the folder",
+        help="write the pages of docs/ that the parts belong to, the other parts from the folder",
     )
     parser.add_argument("--seeds", type=int, default=worlds.SEEDS, help="random worlds")
     parser.add_argument(

@@ -138,3 +138,9 @@ def test_cold_start_times_each_case_and_the_empty_cache_once(bench, monkeypatch)
     assert runs["slipcar, numba"] == 3
     assert runs[cold.FIRST_EVER] == 1
     assert "CasADi + fatrop" not in runs
+
+
+def test_every_part_belongs_to_one_page(bench):
+    run = bench("run")
+    parts = [part for _, _, of_page in run.PAGES for part in of_page]
+    assert sorted(parts) == sorted(run.PARTS + run.LONG_PARTS)
