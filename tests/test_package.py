@@ -238,7 +238,8 @@ def test_the_command_answers():
     script = Path(sys.executable).with_name("slipcar")
     done = subprocess.run([script, "--help"], capture_output=True, text=True, cwd="/")
     assert done.returncode == 0, done.stderr
-    assert all(command in done.stdout for command in ("compare", "plan", "simulate", "train"))
+    commands = ("compare", "frontier", "plan", "simulate", "train")
+    assert all(command in done.stdout for command in commands)
 
 
 # --- what is shipped -----------------------------------------------------------------------

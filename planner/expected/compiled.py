@@ -13,16 +13,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from slipcar.planner.expected.arrays import (
-    cost,
-    expectations,
-    fill_losses,
-    model_change,
-    priced,
-    propagate,
-    quadratic,
-    row_hessians,
-)
+from slipcar.planner.expected.arrays import cost, fill_losses, model_change, priced, quadratic
+from slipcar.planner.expected.belief_arrays import expectations, propagate, row_hessians
 from slipcar.planner.newton import compiled as newton
 from slipcar.planner.newton.caching import stamp
 from slipcar.planner.newton.compiled import gramian_trace, half_largest
@@ -257,7 +249,9 @@ def _compiled(version: int) -> Any:
 
 def _sources() -> Any:
     here, there = Path(__file__), Path(newton.__file__)
-    own = [here.with_name(f"{name}.py") for name in ("compiled", "arrays", "losses")]
+    own = [
+        here.with_name(f"{name}.py") for name in ("compiled", "arrays", "belief_arrays", "losses")
+    ]
     return itertools.chain(own, (there.with_name(f"{name}.py") for name in newton.SOURCES))
 
 
