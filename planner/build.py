@@ -11,7 +11,7 @@ from slipcar.planner.moments import trace_integral
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem import Model, Problem
+from slipcar.planner.problem import Model, Problem, penalty_cost
 from slipcar.planner.steering import Steering
 
 Array = np.ndarray
@@ -30,7 +30,6 @@ def build_steered(
 ) -> Plan:
     """A plan of an expected cost, which started from the plan of the mean `nominal`."""
     found = steered.found
-    penalties = model.penalty(model.times[1:], found.x[1:])
     outcome = dataclasses.replace(
         nominal,
         status=steered.status,
@@ -40,7 +39,7 @@ def build_steered(
         B=found.B,
         covariance=found.covariance,
         effort=found.effort,
-        penalty=float(np.vdot(model.dt[:, None] * model.weight, np.maximum(penalties, 0.0) ** 2)),
+        penalty=penalty_cost(model, found.x),
         running=found.running,
         adjoint=found.adjoint,
         terminal=found.terminal,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.control_set import control_ball, control_limits, project_controls
-from slipcar.planner.feedback import default_tracking, lqr_gains, weight_matrix
+from slipcar.planner.feedback import default_tracking, lqr_gains, weight_matrix, wrap
 from slipcar.planner.plan import Plan
 
 Array = np.ndarray
@@ -145,9 +145,7 @@ class Feedback(OpenLoop):
     def control(self, t: Any, x: Any) -> Array:
         """Control in physical units at times t (...,) [s] and states x (..., n): (..., m)."""
         k = self._interval(t)
-        error = np.asarray(x) - self.plan.mean[k]
-        for i in self._angles:  # observations know headings modulo 2π
-            error[..., i] -= 2.0 * np.pi * np.round(error[..., i] / (2.0 * np.pi))
+        error = wrap(np.asarray(x) - self.plan.mean[k], self._angles)
         assert self.plan.gains is not None
         # A sum over states rather than a matrix product: the same bits for any batch size.
         correction = (self.plan.gains[k] * error[..., None, :]).sum(axis=-1)

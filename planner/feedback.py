@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,13 @@ def lqr_gains(A: Array, B: Array, dt: Array, Q: Array, R: Array, Qf: Array) -> A
         closed = A[k] + B[k] @ K[k]
         P = closed.T @ P @ closed + K[k].T @ Rk @ K[k] + (dt[k] * Q if k else 0.0)
     return K
+
+
+def wrap(error: Array, angles: Iterable[int]) -> Array:
+    """Deviations (..., n) with their angles in [−π, π], in place: headings are known modulo 2π."""
+    for i in angles:
+        error[..., i] -= 2.0 * np.pi * np.round(error[..., i] / (2.0 * np.pi))
+    return error
 
 
 def weight_matrix(name: str, value: Any, n: int, *, definite: bool = False) -> Array:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from slipcar.planner.expected.engine import engine
 from slipcar.planner.expected.field import priced
 from slipcar.planner.expected.guarded import posed
 from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.stakes import Stakes
 from slipcar.planner.horizon_batch import Replanner
-from slipcar.planner.method import compiled_functions, driver
 from slipcar.planner.moments import trace_integral
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.newton.functions import Functions
-from slipcar.planner.options import Options
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem import Model
+from slipcar.planner.problem import Model, penalty_cost
 from slipcar.planner.steering import Request
 
 Array = np.ndarray
@@ -67,33 +64,20 @@ def replanner(
     guess: tuple[Array, Array],
 ) -> Replanner:
     """With compiled functions where they can be had."""
-    found = posed(problem)
-    run: ModuleType | None = None
-    functions: Functions | None = None
-    if compiled is not False and driver() is not None:
-        functions = found.functions(*guess, native=True)
-        if functions.kernels is None:
-            compiled_functions(found.model, Options(compiled=compiled), *guess)  # raises if asked
-            functions = None
-        else:
-            from slipcar.planner.expected import run as fast
-
-            run = fast
-    if functions is None:
-        functions = found.functions(*guess, native=False)
-    return Replanner(found.model, functions, stakes, iterations, tolerance, workers, run)
+    ready = posed(problem)
+    functions, run = engine(ready, *guess, compiled=compiled)
+    return Replanner(ready.model, functions, stakes, iterations, tolerance, workers, run)
 
 
 def as_plan(first: Plan, found: Steered, model: Model, seconds: float) -> Plan:
     """The plan that the expected cost makes of a plan of the mean."""
-    c = np.maximum(found.c[:, : len(model.weight)], 0.0)
     return first.replace(
         status=found.status,
         mean=found.x,
         controls=found.u,
         covariance=found.covariance,
         effort=found.effort,
-        obstacle_cost=float(np.vdot(model.dt[:, None] * model.weight, c * c)),
+        obstacle_cost=penalty_cost(model, found.x),
         running_cost=found.running,
         variance=trace_integral(found.covariance, model.dt),
         iterations=first.iterations + found.iterations,

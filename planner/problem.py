@@ -180,6 +180,12 @@ class Model:
         return checked_trajectory(self, x, u)
 
 
+def penalty_cost(model: Model, x: Array) -> float:
+    """Σ dt Σ w max(0, c)² along states (N, n)."""
+    c = np.maximum(model.penalty(model.times[1:], x[1:]), 0.0)
+    return float(np.vdot(model.dt[:, None] * model.weight, c * c))
+
+
 def checked_trajectory(model: Model, x: Any, u: Any) -> tuple[Array, Array]:
     """States (N, n) starting at `start` and admissible controls (N−1, m), as float64.
 

@@ -4,7 +4,7 @@ At node k with state x the controller plays the first control of
 
     minimise E[ cost of the intervals left | x_k = x ] over ū and K,   u = ū + K (x − μ)
 
-(:mod:`slipcar.planner.expected`): the expected cost to second order in the noise, given that it
+(:mod:`slipcar.planner.expected`): the expected cost for Gaussian states, given that it
 will go on to correct. A certainty-equivalent replan does not know that the noise to come depends
 on what it chooses; this one does, and a Newton step from the last plan makes it.
 """
@@ -19,6 +19,7 @@ import numpy as np
 
 from slipcar.planner.codegen.traced import parameter_row
 from slipcar.planner.controllers import OpenLoop
+from slipcar.planner.feedback import wrap
 from slipcar.planner.horizon_batch import Tails
 from slipcar.planner.horizon_setup import as_plan, handover_of, replanner, stakes_of
 from slipcar.planner.options import check_count, check_number
@@ -299,6 +300,4 @@ class RecedingHorizon(OpenLoop):
 
 def _unwrapped(x: Array, mean: Array, angles: tuple[int, ...]) -> Array:
     """States (P, n) with angles on the plan's branch: observations know them modulo 2π."""
-    for i in angles:
-        x[:, i] -= 2.0 * np.pi * np.round((x[:, i] - mean[:, i]) / (2.0 * np.pi))
-    return x
+    return mean + wrap(x - mean, angles)

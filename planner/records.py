@@ -52,7 +52,7 @@ class TimeStep:
 
 @dataclasses.dataclass(frozen=True)
 class ExpectedCost:
-    """What a plan costs in expectation, to second order in the noise (Gaussian states).
+    """What a plan costs in expectation, for Gaussian states (linearised moments).
 
     Attributes:
         effort: Σ dt ūᵀRū.

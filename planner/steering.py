@@ -2,7 +2,7 @@
 
     minimise  E[ Σ dt (uᵀRu + H + Σ w max(0, c)²) + gᵀWg ] + w ∫ tr Σ dt,   P(constraint) ≤ δ
 
-to second order in the noise (:mod:`.expected`). The chance constraint is priced: ν times Boole's
+for Gaussian states (:mod:`.expected`). The chance constraint is priced: ν times Boole's
 bound joins the cost, which allocates the risk over nodes and rows, and ν is searched for until
 simulated paths keep δ (:mod:`.price_search`, :mod:`.monte_carlo`).
 """
@@ -21,6 +21,7 @@ from slipcar.planner.expected.field import Field, expected_cost, priced
 from slipcar.planner.expected.guarded import Posed, posed
 from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.stakes import Stakes
+from slipcar.planner.feedback import wrap
 from slipcar.planner.monte_carlo import violations
 from slipcar.planner.options import Options, check_count, check_number
 from slipcar.planner.outcome import Outcome
@@ -189,10 +190,7 @@ def law(model: Model, found: Steered) -> Any:
         k = int(np.argmin(np.abs(starts - t)))
         if not closed:
             return np.broadcast_to(found.u[k], (*np.shape(x)[:-1], found.u.shape[1]))
-        error = x - found.x[k]
-        for i in angles:
-            error[..., i] -= 2.0 * np.pi * np.round(error[..., i] / (2.0 * np.pi))
-        u = found.u[k] + error @ found.gains[k].T
+        u = found.u[k] + wrap(x - found.x[k], angles) @ found.gains[k].T
         return project_controls(u, model.lower, model.upper, model.radius)
 
     return control

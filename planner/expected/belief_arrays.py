@@ -12,7 +12,13 @@ import numpy as np
 
 from slipcar.planner.expected.arrays import row_loss, row_weight
 from slipcar.planner.expected.losses import FLOOR
-from slipcar.planner.newton.iterate_arrays import congruence, noise_cost_at, semidefinite
+from slipcar.planner.newton.iterate_arrays import (
+    congruence,
+    noise_cost_at,
+    noise_of,
+    semidefinite,
+    spread,
+)
 from slipcar.planner.newton.native import call
 
 
@@ -73,12 +79,9 @@ def covariance(closed, sigma, d_sigma, dt, Sigma):
     scratch, noise = np.empty((n, n)), np.empty((n, n))
     Sigma[0] = 0.0
     for k in range(K):
-        noise[:] = 0.0
+        noise_of(sigma[k], noise)
+        # Σ of the states that σ depends on adds to the noise: σ′ Σ σ′ᵀ.
         for a in range(d):
-            for i in range(n):
-                for j in range(n):
-                    noise[i, j] += sigma[k, i, a] * sigma[k, j, a]
-            # Σ of the states that σ depends on adds to the noise: σ′ Σ σ′ᵀ.
             for i in range(n):
                 for y in range(n):
                     b = d_sigma[k, i, a, y]
@@ -88,19 +91,7 @@ def covariance(closed, sigma, d_sigma, dt, Sigma):
                             if c != 0.0:
                                 for j in range(n):
                                     noise[i, j] += c * d_sigma[k, j, a, z]
-        scratch[:] = 0.0
-        for i in range(n):
-            for v in range(n):
-                b = closed[k, i, v]
-                if b != 0.0:
-                    for j in range(n):
-                        scratch[i, j] += b * Sigma[k, v, j]
-        for i in range(n):
-            for j in range(n):
-                value = dt[k] * noise[i, j]
-                for v in range(n):
-                    value += scratch[i, v] * closed[k, j, v]
-                Sigma[k + 1, i, j] = value
+        spread(closed[k], Sigma[k], dt[k], noise, scratch, Sigma[k + 1])
 
 
 @numba.njit(error_model="numpy")

@@ -17,13 +17,19 @@ from slipcar.planner.expected.arrays import cost, fill_losses, model_change, pri
 from slipcar.planner.expected.belief_arrays import expectations, propagate, row_hessians
 from slipcar.planner.newton import compiled as newton
 from slipcar.planner.newton.caching import stamp
-from slipcar.planner.newton.compiled import gramian_trace, half_largest
+from slipcar.planner.newton.compiled import (
+    CONVERGED,
+    MAX_ITERATIONS,
+    NO_STEP,
+    NOT_FINITE,
+    STALLED,
+    gramian_trace,
+    half_largest,
+)
 from slipcar.planner.newton.iterate_arrays import evaluate, inconsistency, storage
 from slipcar.planner.newton.model_arrays import active_bounds, clip, load, respond
 from slipcar.planner.newton.riccati import SOFTNESS, solve_lq, workspace
 from slipcar.planner.newton.sweep import sweep
-
-CONVERGED, MAX_ITERATIONS, STALLED, NO_STEP, NOT_FINITE = range(5)
 
 
 @numba.njit(error_model="numpy")
@@ -214,9 +220,9 @@ def _iterate(
             status = CONVERGED
             break
         last = step
-    every = np.ones(p, dtype=np.bool_)
-    row_hessians(addresses, parameters, times, at[14], every, bend)
-    expectations(bend, Sigma, every, offset)
+    others = weight <= 0.0  # those that are charged are known
+    row_hessians(addresses, parameters, times, at[14], others, bend)
+    expectations(bend, Sigma, others, offset)
     x[:], u[:], A_out[:], B_out[:] = at[14], at[15], at[1], at[2]
     for k in range(K):
         for o in range(p):

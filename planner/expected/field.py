@@ -15,11 +15,11 @@ import numpy as np
 
 from slipcar.planner.expected import loop
 from slipcar.planner.expected.belief import feedback_effort, loss_at
+from slipcar.planner.expected.engine import engine
 from slipcar.planner.expected.guarded import Posed
 from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.losses import loss
 from slipcar.planner.expected.stakes import Stakes
-from slipcar.planner.method import driver
 from slipcar.planner.moments import trace_integral
 from slipcar.planner.options import Options
 from slipcar.planner.problem import Model
@@ -94,19 +94,8 @@ class Field:
         self._known: list[list[tuple[float, Steered]]] = [[] for _ in guesses]
         self._alive = list(range(len(self._guesses)))
         self._origin: dict[int, int] = {}
-        x, u = self._guesses[0]
-        self._iterate: Any = loop.iterate
-        self._functions = None
-        if options.compiled is not False and driver() is not None:
-            functions = ready.functions(x, u, native=True)
-            if functions.kernels is not None:
-                from slipcar.planner.expected import run
-
-                self._iterate, self._functions = run.iterate, functions
-            elif options.compiled:
-                raise ValueError(f"compiled=True, but {functions.reason}")
-        if self._functions is None:
-            self._functions = ready.functions(x, u, native=False)
+        self._functions, run = engine(ready, *self._guesses[0], compiled=options.compiled)
+        self._iterate: Any = loop.iterate if run is None else run.iterate
 
     def solve(self, price: float) -> Steered | None:
         """The best converged plan at a price, or None."""

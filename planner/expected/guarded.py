@@ -85,12 +85,12 @@ class Posed:
     Attributes:
         guarded: it.
         model: checked and completed.
-        found: functions met so far, by (native, integrator).
+        found: functions met so far, by whether they are native.
     """
 
     guarded: Guarded
     model: Model
-    found: dict[Any, Functions]
+    found: dict[bool, Functions]
 
     def functions(self, x: Array, u: Array, *, native: bool) -> Functions:
         """Its six functions, compared with its own near x, u once."""

@@ -320,17 +320,17 @@ def _search(
     price = 0.5 * float(np.max(np.abs(found.adjoint)))
     dear = 0.0 if stakes.soft else 0.5 * float(np.max(np.abs(found.terminal), initial=0.0))
 
-    def lagrangian(point: Iterate) -> tuple[float, float]:
+    def priced(point: Iterate) -> tuple[float, float]:
+        """Σ λᵀf + νᵀg, and what is lacking, priced."""
         f, g = point.lin.defect, point.lin.g
         lacking = price * float(np.abs(f).sum()) + dear * float(np.abs(g).sum())
-        value = _cost(model, stakes, point, belief) + float(np.vdot(found.adjoint, f))
+        value = float(np.vdot(found.adjoint, f))
         return value + (0.0 if stakes.soft else float(np.vdot(found.terminal, g))), lacking
 
-    before, lacking = lagrangian(at)
-    cost = _cost(model, stakes, at, belief)
-    gain = before - cost - change
+    value, lacking = priced(at)
+    gain = value - change
     factor = max(1.0, -gain / (0.75 * lacking)) if lacking > 0.0 else 1.0
-    before += factor * lacking
+    before = _cost(model, stakes, at, belief) + value + factor * lacking
     predicted = gain + factor * lacking
     noise = tuning.noise * (1.0 + abs(before))
     # Rows and dynamics are far from their models beyond some length of a step.
@@ -343,8 +343,8 @@ def _search(
         new = evaluate(model, functions, 0.0, x, lin.u + alpha * e)
         actual, accepted = -np.inf, False
         if new.finite:
-            merit, rest = lagrangian(new)
-            actual = before - merit - factor * rest
+            value, rest = priced(new)
+            actual = before - _cost(model, stakes, new, belief) - value - factor * rest
             accepted = (predicted <= noise and actual >= -noise) or (
                 actual >= tuning.armijo * alpha * predicted
             )

@@ -16,21 +16,15 @@ from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.settings import TUNING, Tuning
 from slipcar.planner.expected.stakes import Stakes
 from slipcar.planner.newton.caching import prepare
+from slipcar.planner.newton.compiled import CONVERGED, NOT_FINITE
 from slipcar.planner.newton.functions import Functions
+from slipcar.planner.newton.run import STATUS
 from slipcar.planner.problem import Model
-from slipcar.planner.status import Status
 
 Array = np.ndarray
 
 #: Whether the compiled code is loaded.
 _prepared = False
-STATUS = {
-    compiled.CONVERGED: Status.CONVERGED,
-    compiled.MAX_ITERATIONS: Status.MAX_ITERATIONS,
-    compiled.STALLED: Status.STALLED,
-    compiled.NO_STEP: Status.SOLVER_FAILED,
-    compiled.NOT_FINITE: Status.SOLVER_FAILED,
-}
 
 
 @dataclasses.dataclass(eq=False)
@@ -89,7 +83,7 @@ class Batch:
 
     def ok(self) -> Array:
         """Which have converged, (P,)."""
-        return self.ended[:, 0] == compiled.CONVERGED
+        return self.ended[:, 0] == CONVERGED
 
 
 def advance(
@@ -198,7 +192,7 @@ def iterate(
         functions.kernels, model, functions.parameters, stakes, batch, tolerance=tolerance,
         max_iterations=max_iterations, warm=warm is not None, tuning=tuning,
     )  # fmt: skip
-    if batch.ended[0, 0] == compiled.NOT_FINITE:
+    if batch.ended[0, 0] == NOT_FINITE:
         raise ValueError("the problem's functions are not finite along the guess")
     return steered(batch, 0)
 

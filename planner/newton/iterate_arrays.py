@@ -232,25 +232,44 @@ def inconsistency(at):
 @numba.njit(error_model="numpy")
 def covariance(A, sigma, dt, Sigma):
     """`moments.covariance`."""
-    K, n, d = sigma.shape
-    AS = np.empty((n, n))
+    K, n, _ = sigma.shape
+    scratch, noise = np.empty((n, n)), np.empty((n, n))
     Sigma[0] = 0.0
     for k in range(K):
-        AS[:] = 0.0
+        noise_of(sigma[k], noise)
+        spread(A[k], Sigma[k], dt[k], noise, scratch, Sigma[k + 1])
+
+
+@numba.njit(error_model="numpy")
+def noise_of(sigma, noise):
+    """Write σσᵀ."""
+    n, d = sigma.shape
+    noise[:] = 0.0
+    for a in range(d):
         for i in range(n):
+            b = sigma[i, a]
+            if b != 0.0:
+                for j in range(n):
+                    noise[i, j] += b * sigma[j, a]
+
+
+@numba.njit(error_model="numpy")
+def spread(A, S, dt, noise, scratch, out):
+    """Write A S Aᵀ + dt noise."""
+    n = len(A)
+    scratch[:] = 0.0
+    for i in range(n):
+        for v in range(n):
+            a = A[i, v]
+            if a != 0.0:
+                for j in range(n):
+                    scratch[i, j] += a * S[v, j]
+    for i in range(n):
+        for j in range(n):
+            value = dt * noise[i, j]
             for v in range(n):
-                a = A[k, i, v]
-                if a != 0.0:
-                    for j in range(n):
-                        AS[i, j] += a * Sigma[k, v, j]
-        for i in range(n):
-            for j in range(n):
-                value = 0.0
-                for v in range(n):
-                    value += AS[i, v] * A[k, j, v]
-                for v in range(d):
-                    value += dt[k] * sigma[k, i, v] * sigma[k, j, v]
-                Sigma[k + 1, i, j] = value
+                value += scratch[i, v] * A[j, v]
+            out[i, j] = value
 
 
 @numba.njit(error_model="numpy")

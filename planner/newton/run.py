@@ -29,7 +29,7 @@ Array = np.ndarray
 
 #: Whether the compiled code is loaded.
 _prepared = False
-_STATUS = {
+STATUS = {
     compiled.CONVERGED: Status.CONVERGED,
     compiled.MAX_ITERATIONS: Status.MAX_ITERATIONS,
     compiled.STALLED: Status.STALLED,
@@ -72,7 +72,7 @@ class Answers:
 
     def status(self, i: int) -> Status:
         """How problem i ended."""
-        return _STATUS[int(self.ended[i, 0])]
+        return STATUS[int(self.ended[i, 0])]
 
     def finite(self, i: int) -> bool:
         """Whether the functions of problem i are finite along its guess."""

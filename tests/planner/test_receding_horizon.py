@@ -367,3 +367,11 @@ def test_states_of_something_else(controller):
             controller.predict(obs[:2], bad)
     with pytest.raises(ValueError, match="episode_start"):
         controller.predict(obs, state, np.zeros(2, dtype=bool))
+
+
+def test_the_obstacle_cost_of_its_plan_is_that_of_the_mean(controller):
+    problem, mean = controller.plan.problem, controller.plan.mean
+    dt = problem.dt
+    assert controller.plan.obstacle_cost == pytest.approx(
+        dt * np.sum(problem.obstacle_power(mean[1:])), rel=1e-9
+    )
