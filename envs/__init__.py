@@ -9,12 +9,15 @@ The module prefix in the id makes it work everywhere, in spawned workers too.
 
 import gymnasium as gym
 
+from slipcar.envs.families import HELD_OUT_SEEDS, Family
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import SlipCarEnv
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.vector import SlipCarVectorEnv
 
 __all__ = [
+    "HELD_OUT_SEEDS",
+    "Family",
     "Scenario",
     "SlipCarEnv",
     "SlipCarVectorEnv",

@@ -5,15 +5,48 @@
     goal     = (x_N − x^f)ᵀ W (x_N − x^f)
     collision: ‖r_k − r_o‖ < δ_o at any node k = 1..N−1
 
-The functions below are the summands, batched over leading axes, for NumPy and Torch.
-Obstacles are rows (x, y, radius) [m].
+`ring_depth`, `rim_distance`, `hinge_cost` and `weighted_square` are these formulas, on components
+(:mod:`slipcar.envs.arrays`). The other functions put them into arrays, batched over leading
+axes, for NumPy and Torch. Obstacles are rows (x, y, radius) [m].
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from slipcar.envs.arrays import array_namespace
+from slipcar.envs.arrays import array_namespace, functions_of
+
+
+def ring_depth(squared: Any, reach: Any) -> Any:
+    """c_o at squared distance ‖r − r_o‖² [m²], `reach` = δ_o + ε [m]: [m²]."""
+    return reach * reach - squared
+
+
+def rim_distance(squared: Any, radius: Any, sqrt: Any) -> Any:
+    """‖r − r_o‖ − δ_o at squared distance ‖r − r_o‖² [m²], negative inside: [m]."""
+    return sqrt(squared) - radius
+
+
+def hinge_cost(c: Any, positive: Any) -> Any:
+    """max(0, c)², given the function max(0, ·)."""
+    depth = positive(c)
+    return depth * depth
+
+
+def weighted_square(errors: Any, weights: Any) -> Any:
+    """Σ W_i e_i² over components."""
+    total = weights[0] * errors[0] * errors[0]
+    for weight, error in zip(weights[1:], errors[1:], strict=True):
+        total = total + weight * error * error
+    return total
+
+
+def arrived(x: Any, goal: Any, tolerance: Any) -> Any:
+    """Whether |x_i − x^f_i| ≤ tolerance_i for all components."""
+    within: Any = True
+    for state, target, most in zip(x, goal, tolerance, strict=True):
+        within = within & (abs(state - target) <= most)
+    return within
 
 
 def control_power(u: Any) -> Any:
@@ -31,8 +64,7 @@ def squared_distances(x: Any, obstacles: Any) -> Any:
 
 def obstacle_constraints(x: Any, obstacles: Any, clearance: Any) -> Any:
     """c_o(r) = (δ_o + ε)² − ‖r − r_o‖², positive inside the clearance ring, (..., k) [m²]."""
-    reach = obstacles[..., 2] + clearance
-    return reach * reach - squared_distances(x, obstacles)
+    return ring_depth(squared_distances(x, obstacles), obstacles[..., 2] + clearance)
 
 
 def obstacle_constraints_jacobian(x: Any, obstacles: Any) -> Any:
@@ -46,9 +78,7 @@ def obstacle_constraints_jacobian(x: Any, obstacles: Any) -> Any:
 
 def hinge_squared(c: Any) -> Any:
     """φ summed over obstacles: Σ_o max(0, c_o)², (..., k) -> (...,)."""
-    xp = array_namespace(c)
-    positive = xp.where(c > 0, c, 0.0 * c)
-    return xp.sum(positive * positive, axis=-1)
+    return array_namespace(c).sum(hinge_cost(c, functions_of(c).positive), axis=-1)
 
 
 def obstacle_power(x: Any, obstacles: Any, clearance: Any, weight: Any) -> Any:
@@ -58,15 +88,17 @@ def obstacle_power(x: Any, obstacles: Any, clearance: Any, weight: Any) -> Any:
 
 def goal_cost(x: Any, goal: Any, weight: Any) -> Any:
     """(x − x^f)ᵀ diag(W) (x − x^f), (..., 5) -> (...,); `weight` is (5,)."""
-    xp = array_namespace(x)
     error = x - goal
-    return xp.sum(weight * error * error, axis=-1)
+    components = range(error.shape[-1])
+    return weighted_square(
+        [error[..., i] for i in components], [weight[..., i] for i in components]
+    )
 
 
 def obstacle_distances(x: Any, obstacles: Any) -> Any:
     """‖r − r_o‖ − δ_o to every obstacle [m], (..., 5) and (k, 3) -> (..., k)."""
-    xp = array_namespace(x)
-    return xp.sqrt(squared_distances(x, obstacles)) - obstacles[..., 2]
+    sqrt = array_namespace(x).sqrt
+    return rim_distance(squared_distances(x, obstacles), obstacles[..., 2], sqrt)
 
 
 def signed_distance(x: Any, obstacles: Any) -> Any:

@@ -2,45 +2,101 @@
 
     x⁺ = x + h b(x, u) + √h σ(x) ξ,     ξ ~ N(0, I),   h = dt / substeps
 
-Strong order: 1/2 for general diffusions. Here it is 1, because σ depends on (v, ω) alone
-and the noise never reaches them: the Milstein correction (σ·∇)σ vanishes identically.
+Strong order: 1/2 for general diffusions. With slip alone it is 1, because σ depends on (v, ω)
+alone and the noise never reaches them: the Milstein correction (σ·∇)σ vanishes identically.
+Constant noise on the pose changes nothing in that. Constant noise on v and ω does: then they are
+noisy, and their noise does not commute with the slip.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from slipcar.envs import car
-from slipcar.envs.arrays import array_namespace
+from slipcar.envs.arrays import Functions, array_namespace, functions_of
 
-#: Strong order of convergence for this car (see the module's docstring).
+#: Five, two or three components, side by side: a sequence, or the rows of an array.
+Components: TypeAlias = Any
+
+#: Strong order of convergence of the slipping car (see the module's docstring).
 STRONG_ORDER = 1.0
 
 
-def euler_maruyama(x: Any, u: Any, dt: float, noise: Any, slip: Any) -> Any:
+def increments(
+    x: Components,
+    u: Components,
+    dt: Any,
+    root_dt: Any,
+    noise: Components,
+    slip: Components,
+    process: Sequence[tuple[int, Any]],
+    functions: Functions,
+) -> list[Any]:
+    """What one Euler–Maruyama step adds to the state, on components (:mod:`slipcar.envs.arrays`).
+
+    Args:
+        x: the five components of the state.
+        u: the two of the control.
+        dt: h [s].
+        root_dt: √h.
+        noise: standard normal variates: three for the slip, then one for each pair of `process`.
+        slip: (α², β²).
+        process: pairs (component of the state, standard deviation per √s).
+        functions: for this kind of component.
+    """
+    theta, v, omega = x[2], x[3], x[4]
+    b = car.rates(v, omega, functions.cos(theta), functions.sin(theta), u[0], u[1])
+    position, heading = car.slip_rates(v, omega, slip[0], slip[1])
+    position, heading = root_dt * position, root_dt * heading
+    added = [dt * rate for rate in b]
+    added[0] = added[0] + position * noise[0]
+    added[1] = added[1] + position * noise[1]
+    added[2] = added[2] + heading * noise[2]
+    for (i, deviation), variate in zip(process, noise[car.NOISE_DIM :], strict=True):
+        added[i] = added[i] + root_dt * deviation * variate
+    return added
+
+
+def added_up(x: Components, added: Components) -> list[Any]:
+    """X + added, component by component."""
+    return [before + change for before, change in zip(x, added, strict=True)]
+
+
+def euler_maruyama(
+    x: Any, u: Any, dt: float, noise: Any, slip: Any, process: Sequence[tuple[int, float]] = ()
+) -> Any:
     """Advance one control interval of length `dt`, the control held constant.
 
     Args:
         x: states at the node, (..., 5).
         u: controls, (..., 2).
         dt: length of the interval [s].
-        noise: standard normal variates, (..., substeps, 3); their number sets the substeps.
+        noise: standard normal variates, (..., substeps, 3 + p); their number sets the substeps.
         slip: (α², β²).
+        process: p pairs (component of the state, standard deviation per √s) of constant noise.
 
     Returns:
         States at the next node, (..., 5).
     """
     xp = array_namespace(x, u, noise)
-    substeps = noise.shape[-2]
+    substeps, columns = noise.shape[-2:]
     h = dt / substeps
-    root = h**0.5
+    state: Components = [x[..., i] for i in range(car.STATE_DIM)]
+    control = [u[..., i] for i in range(car.CONTROL_DIM)]
+    functions = functions_of(state[0])
     for j in range(substeps):
-        increment = root * car.slip_intensity(x, slip) * noise[..., j, :]
-        moved = x + h * car.drift(x, u)
-        x = xp.concat([moved[..., :3] + increment, moved[..., 3:]], axis=-1)
-    return x
+        variates = [noise[..., j, i] for i in range(columns)]
+        added = increments(state, control, h, h**0.5, variates, slip, process, functions)
+        state = added_up(state, added)
+    return together(xp, state)
+
+
+def together(xp: Any, x: Components) -> Any:
+    """Components as one array (..., 5)."""
+    return xp.asarray(x) if isinstance(x[0], float) else xp.stack(list(x), axis=-1)
 
 
 def coarsen(noise: np.ndarray, factor: int) -> np.ndarray:

@@ -8,23 +8,41 @@
     6     2 t/T − 1
     7:12  (goal − position, θ^f − θ, v, ω) / time-to-go, clipped to ±5
 
+`egocentric` (15 numbers, for worlds that vary: the same in the car's frame, ahead and to the left,
+and what else differs from world to world):
+
+    0:2   (goal − position) ahead, left / 1 m
+    2:4   cos(θ^f − θ), sin(θ^f − θ)
+    4:7   as above
+    7:12  (goal − position ahead, left, θ^f − θ, v, ω) / time-to-go, clipped to ±5
+    12    time-to-go / 5 s
+    13:15 α² / 0.1, β² / 0.01
+
 `state` (6 numbers): (r_x, r_y, θ, v, ω, t) in SI units.
 
-Both are float32 with finite bounds so wide that no physical path meets them.
+With `slots=k` the k nearest obstacles follow, nearest rim first, four numbers each: centre −
+position (in the car's frame for `egocentric`) [m], radius [m], and 1 as a mask; four zeros where
+there are fewer. All is float32 with finite bounds so wide that no physical path meets them.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
+from slipcar.envs.arrays import FLOATS, Functions, array_namespace, functions_of
+from slipcar.envs.parameters import Parameters
+from slipcar.envs.validate import checked_int
+
 if TYPE_CHECKING:
     from slipcar.envs.scenario import Scenario
 
-KINDS = ("features", "state")
+KINDS = ("features", "state", "egocentric")
 #: Names in order, written beside a trained policy's weights and compared when it is loaded.
 LAYOUTS: dict[str, tuple[str, ...]] = {
     "features": (
@@ -33,10 +51,17 @@ LAYOUTS: dict[str, tuple[str, ...]] = {
         "v/ttg", "omega/ttg",
     ),
     "state": ("r_x", "r_y", "theta", "v", "omega", "t"),
+    "egocentric": (
+        "goal ahead", "goal left", "cos(goal_theta - theta)", "sin(goal_theta - theta)", "v",
+        "omega", "2t/T-1", "(goal ahead)/ttg", "(goal left)/ttg", "(goal_theta - theta)/ttg",
+        "v/ttg", "omega/ttg", "ttg/5s", "alpha2/0.1", "beta2/0.01",
+    ),
 }  # fmt: skip
+SLOT = ("x", "y", "radius", "present")
 
 # In metres. Halved, PPO ends 0.05 to 0.09 higher in total cost (seeds 0, 1 and 3, 3 M steps).
 _POSITION_SCALE = 1.0
+_TIME_SCALE, _SLIP_SCALE = 5.0, (0.1, 0.01)
 _RATE_LIMIT = 5.0
 _WIDE = 1000.0
 
@@ -52,84 +77,230 @@ def check_kind(kind: str) -> str:
     return kind
 
 
-def observation_space(scenario: Scenario, kind: str) -> Box:
-    """Bounds of one observation."""
-    if check_kind(kind) == "state":
-        high = np.full(6, _WIDE)
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """How an observation is laid out.
+
+    Attributes:
+        kind: `features`, `state` or `egocentric`.
+        slots: how many obstacles it shows, >= 0.
+
+    Raises:
+        ValueError: for an unknown kind or a bad number.
+    """
+
+    kind: str = "features"
+    slots: int = 0
+
+    def __post_init__(self) -> None:
+        check_kind(self.kind)
+        object.__setattr__(self, "slots", checked_int("obstacle_slots", self.slots, at_least=0))
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Names of the entries, in order."""
+        slots = tuple(f"obstacle {i}: {name}" for i in range(self.slots) for name in SLOT)
+        return LAYOUTS[self.kind] + slots
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return len(LAYOUTS[self.kind]) + len(SLOT) * self.slots
+
+    @staticmethod
+    def of_size(size: int) -> Layout:
+        """The layout with so many entries: kinds and slots can be told from the number alone.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        for kind, entries in LAYOUTS.items():
+            slots, rest = divmod(size - len(entries), len(SLOT))
+            if rest == 0 and slots >= 0:
+                return Layout(kind, slots)
+        sizes = " or ".join(f"{len(entries)} ({kind})" for kind, entries in LAYOUTS.items())
+        raise ValueError(
+            f"an observation has {sizes} entries on its last axis, and {len(SLOT)} more for each "
+            f"obstacle shown, not {size}"
+        )
+
+    def space(self, horizon: float) -> Box:
+        """Bounds of one observation in worlds of at most this horizon [s]."""
+        high = np.full(self.size, _WIDE)
         low = -high
-        low[5], high[5] = 0.0, scenario.horizon
-    else:
-        high = np.full(12, _WIDE)
-        high[[2, 3, 6]] = 1.0
-        high[7:] = _RATE_LIMIT
-        low = -high
-    return Box(low.astype(np.float32), high.astype(np.float32))
+        if self.kind == "state":
+            low[5], high[5] = 0.0, horizon
+        else:
+            high[[2, 3, 6]] = 1.0
+            high[7:12] = _RATE_LIMIT
+            low = -high
+            low[12 : len(LAYOUTS[self.kind])] = 0.0
+        first = len(LAYOUTS[self.kind])
+        low[first + 2 :: 4] = low[first + 3 :: 4] = 0.0
+        high[first + 3 :: 4] = 1.0
+        return Box(low.astype(np.float32), high.astype(np.float32))
 
 
-def observe(scenario: Scenario, kind: str, t: ArrayLike, x: np.ndarray) -> np.ndarray:
+def entries(
+    layout: Layout, p: Parameters, t: Any, x: Any, rims: Any, functions: Functions
+) -> list[Any]:
+    """The entries of an observation, on components (:mod:`slipcar.envs.arrays`).
+
+    Args:
+        layout: which ones.
+        p: the numbers of the scenario, or of as many scenarios as there are cars.
+        t: time [s]: one for all, or an array.
+        x: the five components of the states.
+        rims: distance to every obstacle's rim [m], as `transition.proximity` gives it; it is not
+            looked at without slots.
+        functions: for this kind of component.
+    """
+    clip = functions.clip
+    if layout.kind == "state":
+        seen = [*functions.bounded(x, _WIDE), t]
+        return seen + _slots(layout, p, x, rims, functions, None)
+    theta, v, omega = x[2], x[3], x[4]
+    dx, dy, turn = p.goal[0] - x[0], p.goal[1] - x[1], p.goal[2] - theta
+    cos, sin = functions.cos(theta), functions.sin(theta)
+    frame = None
+    if layout.kind == "egocentric":
+        frame = (cos, sin)
+        dx, dy = _turned(frame, dx, dy)
+        cos, sin = functions.cos(turn), functions.sin(turn)
+    # Never below one step: on the last observation there is nothing left to divide by.
+    to_go = p.horizon - t
+    rate = 1.0 / (max(to_go, p.dt) if isinstance(to_go, float) else _at_least(to_go, p.dt))
+    seen = [
+        *functions.bounded([dx / _POSITION_SCALE, dy / _POSITION_SCALE], _WIDE),
+        cos,
+        sin,
+        *functions.bounded(x[3:5], _WIDE),
+        2.0 * t / p.horizon - 1.0,
+        *(clip(e * rate, -_RATE_LIMIT, _RATE_LIMIT) for e in (dx, dy, turn, v, omega)),
+    ]
+    if layout.kind == "egocentric":
+        seen += [to_go / _TIME_SCALE, p.slip[0] / _SLIP_SCALE[0], p.slip[1] / _SLIP_SCALE[1]]
+    return seen + _slots(layout, p, x, rims, functions, frame)
+
+
+def observe(
+    scenario: Scenario, kind: str, t: ArrayLike, x: np.ndarray, slots: int = 0
+) -> np.ndarray:
     """Observation of the state x at time t.
 
     Args:
-        scenario: gives goal and horizon.
-        kind: `features` or `state`.
+        scenario: gives goal, horizon and obstacles.
+        kind: `features`, `state` or `egocentric`.
         t: times, (...,) [s].
         x: states, (..., 5).
+        slots: how many obstacles are shown.
 
     Returns:
-        float32, (..., 12) or (..., 6).
+        float32, (..., d).
     """
-    t = np.asarray(t, dtype=np.float64)
-    if check_kind(kind) == "state":
-        out = np.empty((*x.shape[:-1], 6), dtype=np.float32)
-        np.clip(x, -_WIDE, _WIDE, out=out[..., :5], casting="same_kind")
-        out[..., 5] = t
-        return out
-    goal = scenario.goal
-    # Never below one step: on the last observation there is nothing left to divide by.
-    rate = 1.0 / np.maximum(scenario.horizon - t, scenario.dt)
-    out = np.empty((*x.shape[:-1], 12), dtype=np.float32)
-    to_goal = goal[:3] - x[..., :3]
-    np.clip(to_goal[..., :2] / _POSITION_SCALE, -_WIDE, _WIDE, out=out[..., 0:2])
-    out[..., 2] = np.cos(x[..., 2])
-    out[..., 3] = np.sin(x[..., 2])
-    np.clip(x[..., 3:], -_WIDE, _WIDE, out=out[..., 4:6])
-    out[..., 6] = 2.0 * t / scenario.horizon - 1.0
-    rate = rate[..., None]
-    np.clip(to_goal * rate, -_RATE_LIMIT, _RATE_LIMIT, out=out[..., 7:10])
-    np.clip(x[..., 3:] * rate, -_RATE_LIMIT, _RATE_LIMIT, out=out[..., 10:12])
-    return out
+    from slipcar.envs.transition import proximity
+
+    layout = Layout(kind, slots)
+    # One row at least, so that every component is an array.
+    states = np.atleast_2d(x)
+    p = Parameters.like(states[..., 0], scenario)
+    components = [states[..., i] for i in range(5)]
+    functions = functions_of(components[0])
+    rims = proximity(p, components, functions)[2] if slots else []
+    seen = entries(layout, p, np.asarray(t, dtype=np.float64), components, rims, functions)
+    out = np.empty((*states.shape[:-1], layout.size), dtype=np.float32)
+    for i, entry in enumerate(seen):
+        out[..., i] = entry
+    return out.reshape(*x.shape[:-1], layout.size)
+
+
+def observation_space(scenario: Scenario, kind: str, slots: int = 0) -> Box:
+    """Bounds of one observation."""
+    return Layout(kind, slots).space(scenario.horizon)
 
 
 def decode(scenario: Scenario, observation: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Time and state from an observation of either kind, told apart by its length.
+    """Time and state from an observation of any kind, told apart by its length.
 
     Args:
         scenario: the one the observation was made with.
-        observation: (..., 12) or (..., 6).
+        observation: (..., d).
 
     Returns:
-        t (...,) [s] and x (..., 5), float64. From `features` θ lies in (−π, π].
+        t (...,) [s] and x (..., 5), float64. θ lies in (−π, π] unless the kind is `state`.
 
     Raises:
-        ValueError: if the last axis has another length.
+        ValueError: if the last axis has a length of no kind.
     """
     observed = np.asarray(observation, dtype=np.float64)
-    size = observed.shape[-1] if observed.ndim else 0
-    if size == 6:
+    layout = Layout.of_size(observed.shape[-1] if observed.ndim else 0)
+    if layout.kind == "state":
         return observed[..., 5], observed[..., :5]
-    if size != 12:
-        raise ValueError(
-            f"an observation has 12 entries (features) or 6 (state) on its last axis, "
-            f"not shape {observed.shape}"
-        )
     t = 0.5 * (observed[..., 6] + 1.0) * scenario.horizon
     x = np.empty((*observed.shape[:-1], 5))
-    x[..., :2] = scenario.goal[:2] - _POSITION_SCALE * observed[..., 0:2]
-    x[..., 2] = np.arctan2(observed[..., 3], observed[..., 2])
+    heading = np.arctan2(observed[..., 3], observed[..., 2])
+    dx, dy = _POSITION_SCALE * observed[..., 0], _POSITION_SCALE * observed[..., 1]
+    if layout.kind == "egocentric":
+        turned = scenario.goal[2] - heading
+        heading = turned - math.tau * np.ceil(turned / math.tau - 0.5)
+        dx, dy = _turned((np.cos(heading), -np.sin(heading)), dx, dy)
+    x[..., 0], x[..., 1] = scenario.goal[0] - dx, scenario.goal[1] - dy
+    x[..., 2] = heading
     x[..., 3:] = observed[..., 4:6]
     return t, x
 
 
-def describe(kind: str) -> dict[str, Any]:
+def describe(kind: str, slots: int = 0) -> dict[str, Any]:
     """The layout as plain data, for a policy's JSON."""
-    return {"kind": check_kind(kind), "entries": list(LAYOUTS[kind])}
+    return {"kind": check_kind(kind), "entries": list(Layout(kind, slots).entries)}
+
+
+def _slots(
+    layout: Layout, p: Parameters, x: Any, rims: Any, functions: Functions, frame: Any
+) -> list[Any]:
+    """Entries of the obstacles shown, the nearest first."""
+    if not layout.slots:
+        return []
+    shown: list[Any] = []
+    for near in _nearest(layout.slots, p, x, rims, functions):
+        dx, dy, radius, present = near
+        if frame is not None:
+            dx, dy = _turned(frame, dx, dy)
+        shown += [functions.clip(dx, -_WIDE, _WIDE), functions.clip(dy, -_WIDE, _WIDE)]
+        shown += [radius, present]
+    nothing = 0.0 * x[0]
+    return shown + [nothing] * (len(SLOT) * layout.slots - len(shown))
+
+
+def _nearest(
+    slots: int, p: Parameters, x: Any, rims: Any, functions: Functions
+) -> list[tuple[Any, Any, Any, Any]]:
+    """(dx, dy, radius, present) of at most `slots` obstacles, by distance of their rims."""
+    if functions is FLOATS:
+        order = sorted(range(len(rims)), key=rims.__getitem__)[:slots]
+        rows = [[column[i] for column in p.obstacles] for i in order]
+        return [(row[0] - x[0], row[1] - x[1], row[2], 1.0) for row in rows]
+    xp = array_namespace(rims)
+    if rims.shape[0] == 0:
+        return []
+    order = xp.argsort(rims, axis=0)[:slots]
+    columns = (p.obstacles[0] - x[0], p.obstacles[1] - x[1], p.obstacles[2] + 0.0 * x[0])
+    # A fleet's worlds are filled up with obstacles infinitely far away.
+    present = xp.isfinite(xp.take_along_axis(rims, order, axis=0))
+    shown = [xp.take_along_axis(column, order, axis=0) for column in columns]
+    dx, dy, radius = (xp.where(present, column, xp.zeros_like(column)) for column in shown)
+    mask = xp.astype(present, dx.dtype)
+    return [(dx[i], dy[i], radius[i], mask[i]) for i in range(order.shape[0])]
+
+
+def _turned(frame: tuple[Any, Any], dx: Any, dy: Any) -> tuple[Any, Any]:
+    """A vector's components ahead and to the left of a heading (cos, sin)."""
+    cos, sin = frame
+    return cos * dx + sin * dy, cos * dy - sin * dx
+
+
+def _at_least(values: Any, low: Any) -> Any:
+    if isinstance(values, np.ndarray):
+        return np.maximum(values, low)
+    xp = array_namespace(values)
+    return xp.maximum(values, xp.zeros_like(values) + low)

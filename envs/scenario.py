@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,12 @@ class Scenario:
         goal_weight: diagonal of W ≥ 0, (5,); a scalar is repeated (default 100).
         slip: (α², β²), both ≥ 0.
         control_bounds: (2,) largest |a_v| [m/s²] and |a_ω| [rad/s²], or None for unbounded.
+        process_noise: (5,) ≥ 0, standard deviation per √s of constant noise on each state, beside
+            the slip; a scalar is repeated (default 0).
+        start_deviation: (5,) ≥ 0, standard deviation of a normal x(0) round `start`; a scalar is
+            repeated (default 0).
+        goal_tolerance: (5,) > 0, the largest |x − x^f| that counts as arrived; a scalar is
+            repeated (default 0.2). Success is to arrive without a collision; no cost knows it.
 
     Raises:
         ValueError: naming the field, the bad value and what is allowed.
@@ -60,6 +67,10 @@ class Scenario:
         default_factory=lambda: np.array([2.0, 4.0])
     )
 
+    process_noise: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(5))
+    start_deviation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(5))
+    goal_tolerance: np.ndarray = dataclasses.field(default_factory=lambda: np.full(5, 0.2))
+
     def __post_init__(self) -> None:
         set_field = functools.partial(object.__setattr__, self)
         set_field("start", checked_array("start", self.start, (car.STATE_DIM,)))
@@ -70,12 +81,14 @@ class Scenario:
         set_field(
             "obstacle_weight", checked_float("obstacle_weight", self.obstacle_weight, at_least=0.0)
         )
-        set_field(
-            "goal_weight",
-            checked_array(
-                "goal_weight", self.goal_weight, (car.STATE_DIM,), at_least=0.0, repeat_scalar=True
-            ),
+        for name in ("goal_weight", "process_noise", "start_deviation"):
+            value = getattr(self, name)
+            shape = (car.STATE_DIM,)
+            set_field(name, checked_array(name, value, shape, at_least=0.0, repeat_scalar=True))
+        tolerance = checked_array(
+            "goal_tolerance", self.goal_tolerance, (car.STATE_DIM,), above=0.0, repeat_scalar=True
         )
+        set_field("goal_tolerance", tolerance)
         set_field("slip", checked_array("slip", self.slip, (2,), at_least=0.0))
         if self.control_bounds is not None:
             set_field(
@@ -152,6 +165,16 @@ class Scenario:
             raise ValueError(f"not a scenario: the text is not JSON ({error})") from error
         if not isinstance(data, dict):
             raise ValueError(f"not a scenario: expected a JSON object, not {type(data).__name__}")
+        return cls.from_dict(data)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Scenario:
+        """The scenario that :meth:`to_dict` gave.
+
+        Raises:
+            ValueError: for unknown or missing fields, or a value out of range.
+        """
+        data = dict(data)
         version = data.pop("format", _FORMAT)
         if version != _FORMAT:
             raise ValueError(
@@ -204,14 +227,22 @@ class Scenario:
         return cls(**{**worlds.random_world(seed, obstacles, turned), **changes})
 
     @classmethod
-    def of(cls, scenario: Scenario | str) -> Scenario:
-        """The scenario itself, or the named one for a string."""
+    def of(cls, scenario: Scenario | str | Mapping[str, Any]) -> Scenario:
+        """The scenario itself; the one of that name; or the one that JSON text or data describe.
+
+        Raises:
+            ValueError: for anything else.
+        """
         if isinstance(scenario, Scenario):
             return scenario
         if isinstance(scenario, str):
-            return cls.named(scenario)
+            text = scenario.lstrip()
+            return cls.from_json(text) if text.startswith("{") else cls.named(scenario)
+        if isinstance(scenario, Mapping):
+            return cls.from_dict(scenario)
         raise ValueError(
-            f"expected a Scenario or one of the names {cls.names()}, not {type(scenario).__name__}"
+            f"expected a Scenario, one of the names {cls.names()}, or what to_json or to_dict "
+            f"gave, not {type(scenario).__name__}"
         )
 
     # ---------------------------------------------------------------- the problem it poses
@@ -244,13 +275,29 @@ class Scenario:
         """∂b/∂x (..., 5, 5) and ∂b/∂u (..., 5, 2)."""
         return car.drift_jacobian(x, u)
 
+    @functools.cached_property
+    def process(self) -> tuple[tuple[int, float], ...]:
+        """Which states process noise reaches, and its standard deviation per √s, p pairs."""
+        deviations = self.process_noise.tolist()
+        return tuple((i, deviation) for i, deviation in enumerate(deviations) if deviation)
+
+    @property
+    def noise_dim(self) -> int:
+        """Brownian motions that drive the car, 3 + p: three of the slip, then the process noise."""
+        return car.NOISE_DIM + len(self.process)
+
+    @functools.cached_property
+    def start_covariance(self) -> np.ndarray:
+        """Covariance of x(0), (5, 5)."""
+        return _frozen(np.diag(self.start_deviation**2))
+
     def diffusion(self, t: Any, x: Any) -> Any:
-        """σ(x), (..., 5, 3)."""
-        return car.diffusion(x, self.slip.tolist())
+        """σ(x), (..., 5, 3 + p)."""
+        return car.diffusion(x, self.slip.tolist(), self.process)
 
     def diffusion_jacobian(self, t: Any, x: Any) -> Any:
-        """∂σ/∂x, (..., 5, 3, 5)."""
-        return car.diffusion_jacobian(x, self.slip.tolist())
+        """∂σ/∂x, (..., 5, 3 + p, 5)."""
+        return car.diffusion_jacobian(x, self.slip.tolist(), self.process)
 
     @functools.cached_property
     def penalty_weight(self) -> np.ndarray:

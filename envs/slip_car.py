@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -10,9 +11,15 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 
 from slipcar.envs import observation as layouts
+from slipcar.envs.arrays import FLOATS
+from slipcar.envs.cost import arrived
+from slipcar.envs.episode import draw_episode
+from slipcar.envs.fleet import base_of, longest_horizon, source_of
+from slipcar.envs.options import check_source, layout_for, read_options
+from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
-from slipcar.envs.transition import control_from_action, draw_noise, transition
-from slipcar.envs.validate import checked_int
+from slipcar.envs.transition import control_from_action, goal_cost, proximity, step
+from slipcar.envs.validate import checked_array, checked_int
 
 RENDER_FPS = 8
 
@@ -42,7 +49,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
     −(x−x^f)ᵀW(x−x^f) as well. The return is exactly minus the path cost (float64).
 
     ## Starting state
-    The scenario's `start`.
+    The scenario's `start`, plus a normal deviation where it has a `start_deviation`.
 
     ## Episode end
     `terminated` at the horizon: the observation holds the time and the horizon belongs to
@@ -52,13 +59,24 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
     ## Information
     `effort`, `obstacle`, `goal`: cost of this step by part. `collision`: whether any node so
     far lay inside a bare radius. `clearance`: smallest signed distance so far [m].
-    `control`: the applied control in physical units.
+    `control`: the applied control in physical units. For safe reinforcement learning `cost`:
+    1.0 where this node lies inside a bare radius, else 0.0 (as in Safety-Gymnasium; with
+    `obstacle_weight=0` obstacles are a constraint alone). `is_success`: at the end, whether the
+    car arrived within the scenario's `goal_tolerance` and never collided.
 
     ## Arguments
-    * `scenario`: a :class:`Scenario` or the name of one, default `"paper"`.
-    * `observation`: `"features"` or `"state"`.
+    * `scenario`: a :class:`Scenario`, the name of one (default `"paper"`), its JSON text or data;
+      or a :class:`Family`, or `"family:NAME"`, of which every episode draws a world.
+    * `observation`: `"features"`, `"state"` or `"egocentric"`.
+    * `obstacle_slots`: how many obstacles the observation shows, the nearest first; by default
+      none for a scenario, and as many as there may be for a family.
     * `substeps`: Euler–Maruyama steps in each control interval, default 1.
     * `terminate_on_collision`: default False.
+
+    ## Reset options
+    * `scenario`: as the argument; stays until another is given.
+    * `noise`: standard normal variates of this episode, (N − 1, substeps, 3 + p), with p the number
+      of states that process noise reaches; in place of drawn ones.
 
     ## Randomness
     Everything comes from `np_random`; the same seed and actions give the same path.
@@ -74,8 +92,9 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        scenario: Scenario | str = "paper",
+        scenario: Any = "paper",
         observation: str = "features",
+        obstacle_slots: int | None = None,
         substeps: int = 1,
         terminate_on_collision: bool = False,
         render_mode: str | None = None,
@@ -85,38 +104,79 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"unknown render_mode {render_mode!r}; allowed are None and "
                 f"{self.metadata['render_modes']}"
             )
-        self.scenario = Scenario.of(scenario)
-        self.observation = layouts.check_kind(observation)
+        self.source = source_of(scenario)
+        self.layout = layout_for(self.source, observation, obstacle_slots)
         self.substeps = checked_int("substeps", substeps, at_least=1)
         self.terminate_on_collision = bool(terminate_on_collision)
         self.render_mode = render_mode
-        self.scenario.action_scale  # noqa: B018  raises now, not at the first step, if unbounded
+        #: What is drawn over the scene beside the trail; see :class:`slipcar.envs.overlay.Overlay`.
+        self.overlay: Any = None
+        base = base_of(self.source)
+        base.action_scale  # noqa: B018  raises now, not at the first step, if unbounded
         self.action_space = Box(-1.0, 1.0, (2,), np.float32)
-        self.observation_space = layouts.observation_space(self.scenario, self.observation)
-        self._noise: np.ndarray | None = None
+        self.observation_space = self.layout.space(longest_horizon(self.source))
+        self._scenario: Scenario | None = None
+        self._noise: list[list[list[float]]] = []
         self._over = True
         self._screen: Any = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """The world of the current episode (of a family before the first: what worlds share)."""
+        return base_of(self.source) if self._scenario is None else self._scenario
+
+    @property
+    def observation(self) -> str:
+        """Kind of observation."""
+        return self.layout.kind
+
+    @property
+    def state(self) -> np.ndarray:
+        """The car's state, (5,) [m, m, rad, m/s, rad/s].
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self._scenario is None:
+            raise ResetNeeded("call reset() first: no episode is running")
+        return np.array(self._x)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode. `options` takes no keys yet.
+        """Start an episode.
+
+        Args:
+            seed: None goes on with the generator.
+            options: `scenario` and `noise`; see the class.
 
         Raises:
-            ValueError: for an unknown option.
+            ValueError: for an unknown option or a bad value of one.
         """
         super().reset(seed=seed)
-        if options:
-            raise ValueError(f"unknown reset options {sorted(options)}; none are known")
-        self._noise = draw_noise(self.np_random, self.scenario, self.substeps)
-        self._x = self.scenario.start.copy()
+        given, noise = read_options(options, ("scenario", "noise"))
+        if given is not None:
+            source = source_of(given)
+            check_source(self.layout, self.observation_space, source)
+            self.source = source
+        episode = draw_episode(self.np_random, self.source, self.substeps)
+        self._scenario = scenario = episode.scenario
+        self._p = Parameters.of(scenario)
+        if noise is None:
+            variates = episode.noise
+        else:
+            shape = (scenario.nodes - 1, self.substeps, scenario.noise_dim)
+            variates = checked_array("noise", noise, shape)
+        self._noise = variates.tolist()
+        self._x: list[float] = episode.start.tolist()
         self._step = 0
         self._over = False
-        self._distance = float(self.scenario.signed_distance(self._x))
+        _, here, self._rims = proximity(self._p, self._x, FLOATS)
+        self._distance = math.inf
         self._trail = [self._x]
         if self.render_mode == "human":
             self.render()
-        return self._observe(), self._info(np.zeros(2), 0.0, 0.0, 0.0)
+        return self._observe(), self._info([0.0, 0.0], 0.0, 0.0, 0.0, here)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control interval.
@@ -125,35 +185,44 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
             ValueError: for a misshapen or non-finite action.
             ResetNeeded: before the first reset or after the episode's end.
         """
-        if self._over or self._noise is None:
+        if self._over:
             raise ResetNeeded("call reset() before step(): no episode is running")
-        u = control_from_action(self.scenario, action)
-        moved = transition(self.scenario, self._x, u, self._noise[self._step])
-        self._x = moved.state
+        scenario, p = self.scenario, self._p
+        u = control_from_action(scenario, action).tolist()
+        moved = step(p, self._x, u, self._noise[self._step], FLOATS)
+        self._x, self._rims = list(moved.state), moved.rims
         self._step += 1
         self._trail.append(self._x)
-        self._distance = min(self._distance, float(moved.distance))
-        at_horizon = self._step == self.scenario.nodes - 1
+        self._distance = min(self._distance, moved.distance)
+        at_horizon = self._step == scenario.nodes - 1
         self._over = at_horizon or (self.terminate_on_collision and self._distance < 0.0)
-        goal = float(self.scenario.goal_cost(self._x)) if self._over else 0.0
-        effort, obstacle = float(moved.effort), float(moved.obstacle)
+        goal = goal_cost(p, self._x) if self._over else 0.0
         if self.render_mode == "human":
             self.render()
-        info = self._info(u, effort, obstacle, goal)
-        return self._observe(), -(effort + obstacle + goal), self._over, False, info
+        info = self._info(u, moved.effort, moved.obstacle, goal, moved.distance)
+        return self._observe(), -(moved.effort + moved.obstacle + goal), self._over, False, info
 
     def _observe(self) -> np.ndarray:
-        t = self._step * self.scenario.dt
-        return layouts.observe(self.scenario, self.observation, t, self._x)
+        t = self._step * self._p.dt
+        seen = layouts.entries(self.layout, self._p, t, self._x, self._rims, FLOATS)
+        return np.array(seen, dtype=np.float32)
 
-    def _info(self, u: np.ndarray, effort: float, obstacle: float, goal: float) -> dict[str, Any]:
+    def _info(
+        self, u: list[float], effort: float, obstacle: float, goal: float, distance: float
+    ) -> dict[str, Any]:
+        clearance = distance if self._step == 0 else self._distance
         return {
             "effort": effort,
             "obstacle": obstacle,
             "goal": goal,
+            "cost": float(self._step > 0 and distance < 0.0),
             "collision": self._distance < 0.0,
-            "clearance": self._distance,
-            "control": u,
+            "clearance": clearance,
+            "control": np.array(u),
+            "is_success": self._over
+            and self._distance >= 0.0
+            and self._step == self.scenario.nodes - 1
+            and bool(arrived(self._x, self._p.goal, self.scenario.goal_tolerance)),
         }
 
     def render(self) -> Any:
@@ -165,13 +234,14 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode is None:
             gym.logger.warn("render() without a render_mode does nothing; pass one to gym.make")
             return None
-        if self._noise is None:
+        if self._scenario is None:
             raise ResetNeeded("call reset() before render()")
-        if self._screen is None:
+        if self._screen is None or self._screen.scenario is not self._scenario:
             from slipcar.envs.render import Screen
 
+            self.close()
             self._screen = Screen(self.scenario, human=self.render_mode == "human", fps=RENDER_FPS)
-        return self._screen.draw(np.stack(self._trail), collided=self._distance < 0.0)
+        return self._screen.draw(np.array(self._trail), collided=self._distance < 0.0)
 
     def close(self) -> None:
         """Close the window, if any."""

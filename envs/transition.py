@@ -1,20 +1,105 @@
-"""One control step of the stochastic car, batched: the core behind all faces.
+"""One control step of the stochastic car: the core behind all faces.
 
-The environment, the vector environment and the evaluation all call :func:`transition` and
-:func:`control_from_action`, so they agree path for path.
+The environment steps one car of floats, the vector environment a fleet of rows, the Torch fleet
+rows on a device, the evaluation blocks of arrays; all of them call :func:`step`, so they agree
+path for path.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slipcar.envs.car import CONTROL_DIM
-from slipcar.envs.integrate import euler_maruyama
+from slipcar.envs import car, cost
+from slipcar.envs.arrays import FLOATS, Functions, array_namespace, functions_of
+from slipcar.envs.integrate import Components, added_up, increments, together
+from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
+
+
+class Moved(NamedTuple):
+    """What one control step led to, on components.
+
+    Attributes:
+        state: x_{k+1}, five components.
+        effort: dt ‖u_k‖².
+        obstacle: dt λ Σ_o max(0, c_o(x_{k+1}))².
+        distance: signed distance of x_{k+1} to the nearest rim [m].
+        rims: signed distance to every rim [m]; see :func:`proximity`.
+    """
+
+    state: Components
+    effort: Any
+    obstacle: Any
+    distance: Any
+    rims: Any
+
+
+def step(
+    p: Parameters,
+    x: Components,
+    u: Components,
+    noise: Any,
+    functions: Functions,
+    add: Callable[[Components, Components], Components] = added_up,
+) -> Moved:
+    """Advance one control interval, on components (:mod:`slipcar.envs.arrays`).
+
+    Args:
+        p: the numbers of the scenario, or of as many scenarios as there are cars.
+        x: the five components of the states.
+        u: the two of the controls.
+        noise: standard normal variates, indexed [substep][component].
+        functions: for this kind of component.
+        add: x and its increments to their sum; a fleet keeps the sum more precisely than the
+            increments are computed.
+    """
+    h = p.dt / len(noise)
+    root = h**0.5
+    for variates in noise:
+        x = add(x, increments(x, u, h, root, variates, p.slip, p.process, functions))
+    power, distance, rims = proximity(p, x, functions)
+    return Moved(x, p.dt * (u[0] * u[0] + u[1] * u[1]), p.dt * power, distance, rims)
+
+
+def proximity(p: Parameters, x: Components, functions: Functions) -> tuple[Any, Any, Any]:
+    """Obstacle cost per second, distance to the nearest rim, and to every rim [m], at states x.
+
+    The last is a list for floats and an array (k, ...) otherwise.
+    """
+    if functions is FLOATS:
+        near = [_near(x, row, functions) for row in zip(*p.obstacles, strict=True)]
+        power = sum(cost for cost, _ in near)
+        rims = [rim for _, rim in near]
+        return p.obstacle_weight * power, min(rims, default=math.inf), rims
+    if len(p.obstacles[0]) == 0:
+        nothing = 0.0 * x[0]
+        return nothing, nothing + math.inf, nothing[None][:0]
+    powers, rims = _near(x, p.obstacles, functions)
+    return p.obstacle_weight * functions.total(powers), functions.smallest(rims), rims
+
+
+def _near(x: Components, row: Components, functions: Functions) -> tuple[Any, Any]:
+    """max(0, c_o)² and the distance to the rim, for one obstacle or for columns of them."""
+    centre_x, centre_y, radius, reach = row
+    dx, dy = x[0] - centre_x, x[1] - centre_y
+    squared = dx * dx + dy * dy
+    depth = cost.ring_depth(squared, reach)
+    return (
+        cost.hinge_cost(depth, functions.positive),
+        cost.rim_distance(squared, radius, functions.sqrt),
+    )
+
+
+def goal_cost(p: Parameters, x: Components) -> Any:
+    """(x − x^f)ᵀ W (x − x^f), on components."""
+    errors = [state - goal for state, goal in zip(x, p.goal, strict=True)]
+    return cost.weighted_square(errors, p.goal_weight)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,14 +120,22 @@ class Transition:
 
 
 def transition(scenario: Scenario, x: Any, u: Any, noise: Any) -> Transition:
-    """Advance states x (..., 5) under controls u (..., 2) with noise (..., substeps, 3)."""
-    dt = scenario.dt
-    state = euler_maruyama(x, u, dt, noise, scenario.slip.tolist())
+    """Advance states x (..., 5) under controls u (..., 2) with noise (..., substeps, 3 + p).
+
+    NumPy and Torch; p is the number of states that the scenario's process noise reaches.
+    """
+    xp = array_namespace(x, u, noise)
+    components = [x[..., i] for i in range(car.STATE_DIM)]
+    controls = [u[..., i] for i in range(car.CONTROL_DIM)]
+    substeps, motions = noise.shape[-2:]
+    variates = [[noise[..., j, i] for i in range(motions)] for j in range(substeps)]
+    functions = functions_of(components[0])
+    moved = step(Parameters.like(x[..., 0], scenario), components, controls, variates, functions)
     return Transition(
-        state=state,
-        effort=dt * scenario.control_power(u),
-        obstacle=dt * scenario.obstacle_power(state),
-        distance=scenario.signed_distance(state),
+        state=together(xp, moved.state),
+        effort=moved.effort,
+        obstacle=moved.obstacle,
+        distance=moved.distance,
     )
 
 
@@ -62,24 +155,27 @@ def control_from_action(
     Raises:
         ValueError: for a wrong shape or a non-finite entry, naming its index.
     """
-    array = np.asarray(action, dtype=np.float64)
-    if array.shape != (*batch, CONTROL_DIM):
-        raise ValueError(f"action must have shape {(*batch, CONTROL_DIM)}, not {array.shape}")
-    if not np.isfinite(array).all():
+    array = checked_action(action, batch, np.float64)
+    return np.clip(array, -1.0, 1.0) * scenario.action_scale
+
+
+def checked_action(action: ArrayLike, batch: tuple[int, ...], dtype: type) -> np.ndarray:
+    """The action as an array (*batch, 2).
+
+    Raises:
+        ValueError: for a wrong shape or a non-finite entry, naming its index.
+    """
+    try:
+        array = np.asarray(action, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"action must be an array of numbers, not {action!r}") from error
+    if array.shape != (*batch, car.CONTROL_DIM):
+        raise ValueError(f"action must have shape {(*batch, car.CONTROL_DIM)}, not {array.shape}")
+    # A sum is finite only where every summand is, and costs a fraction of looking at each.
+    if not math.isfinite(float(array.sum())) and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(
             f"action{list(index)} is {array[index]}; actions must be finite "
             "(they are clipped to [-1, 1])"
         )
-    return np.clip(array, -1.0, 1.0) * scenario.action_scale
-
-
-def draw_noise(
-    rng: np.random.Generator, scenario: Scenario, substeps: int, out: np.ndarray | None = None
-) -> np.ndarray:
-    """All standard normal variates of one episode, (N−1, substeps, 3).
-
-    Drawing an episode at once makes a path depend on its generator alone, not on how many
-    environments run beside it, and is cheaper than drawing step by step.
-    """
-    return rng.standard_normal((scenario.nodes - 1, substeps, 3), out=out)
+    return array

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from slipcar.envs import observation as layouts
+from slipcar.envs.arrays import ARRAYS
+from slipcar.envs.cost import arrived
+from slipcar.envs.episode import halves, read_episodes, words_for_episode
+from slipcar.envs.fleet import Source, Worlds, base_of, longest_horizon, source_of
+from slipcar.envs.noise import Tapes, seeds_of
+from slipcar.envs.options import check_source, layout_for, read_options
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import RENDER_FPS
-from slipcar.envs.transition import control_from_action, draw_noise, transition
-from slipcar.envs.validate import checked_int
+from slipcar.envs.transition import Moved, checked_action, goal_cost, proximity, step
+from slipcar.envs.validate import checked_array, checked_int
+
+DTYPES = ("float32", "float64")
+_INFO = ("effort", "obstacle", "goal", "cost", "collision", "clearance", "control", "is_success")
+_MASKS = tuple(f"_{name}" for name in _INFO)
 
 
 class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -23,16 +33,25 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Each sub-environment has a generator of its own, seeded `seed + i` as Gymnasium's
     `SyncVectorEnv` does, so its paths depend on that seed alone and equal the single
-    environment's.
+    environment's. With a family each draws a new world for every episode.
+
+    States and rewards are float64. What a step adds to them is computed in float32 unless told
+    otherwise: twice as fast, and off by less than the float32 of an observation
+    (`benchmarks/run.py --only environment` measures it).
 
     Args:
         num_envs: how many, at least 1.
-        scenario: shared by all; a :class:`Scenario` or a name.
-        observation: `"features"` or `"state"`.
+        scenario: shared by all: a :class:`Scenario`, a name, JSON text or data; or a
+            :class:`Family` or `"family:NAME"`.
+        observation: `"features"`, `"state"` or `"egocentric"`.
+        obstacle_slots: how many obstacles an observation shows; see `SlipCarEnv`.
         substeps: Euler–Maruyama steps per control interval.
         terminate_on_collision: see `SlipCarEnv`.
         autoreset_mode: NEXT_STEP (Gymnasium's default), SAME_STEP or DISABLED; the enum or
             its value (`"NextStep"`, `"SameStep"`, `"Disabled"`).
+        dtype: `"float32"` or `"float64"`, of what a step adds.
+        render_mode: `"rgb_array"`, one picture for each sub-environment; `"human"`, a window
+            with the first sixteen side by side; or None.
 
     Raises:
         ValueError: naming a bad argument.
@@ -41,11 +60,14 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: Scenario | str = "paper",
+        scenario: Any = "paper",
         observation: str = "features",
+        obstacle_slots: int | None = None,
         substeps: int = 1,
         terminate_on_collision: bool = False,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        dtype: str = "float32",
+        render_mode: str | None = None,
     ) -> None:
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -54,35 +76,82 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(
                 f"unknown autoreset_mode {autoreset_mode!r}; allowed are {allowed}"
             ) from None
-        self.num_envs = checked_int("num_envs", num_envs, at_least=1)
-        self.scenario = Scenario.of(scenario)
-        self.observation = layouts.check_kind(observation)
-        self.substeps = checked_int("substeps", substeps, at_least=1)
-        self.terminate_on_collision = bool(terminate_on_collision)
-        self.scenario.action_scale  # noqa: B018  raises now if the scenario is unbounded
         self.metadata = {
-            "render_modes": [],
+            "render_modes": ["rgb_array", "human"],
             "render_fps": RENDER_FPS,
             "autoreset_mode": self.autoreset_mode,
         }
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(
+                f"unknown render_mode {render_mode!r}; allowed are None and "
+                f"{self.metadata['render_modes']}"
+            )
+        name = np.dtype(dtype).name if dtype in (np.float32, np.float64) else dtype
+        if name not in DTYPES:
+            raise ValueError(f"unknown dtype {dtype!r}; allowed are {list(DTYPES)}")
+        self.num_envs = checked_int("num_envs", num_envs, at_least=1)
+        self.layout = layout_for(source_of(scenario), observation, obstacle_slots)
+        self.substeps = checked_int("substeps", substeps, at_least=1)
+        self.terminate_on_collision = bool(terminate_on_collision)
+        self.render_mode = render_mode
+        self._dtype: Any = np.dtype(name).type
+        self._sources: list[Source] = [source_of(scenario)]
+        self._source_of = np.zeros(self.num_envs, dtype=np.int64)
+        base = base_of(self._sources[0])
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
-        self.single_observation_space = layouts.observation_space(self.scenario, self.observation)
+        horizon = longest_horizon(self._sources[0])
+        self.single_observation_space = self.layout.space(horizon)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
+        self._tapes = Tapes(self.num_envs)
+        self._worlds = Worlds(self.num_envs, self._dtype, base)
         self._ready = False
-        steps = self.scenario.nodes - 1
-        # Steps first, so that the noise of one step of all environments is contiguous.
-        self._noise = np.empty((steps, self.num_envs, self.substeps, 3))
-        self._x = np.tile(self.scenario.start, (self.num_envs, 1))
-        self._steps = np.zeros(self.num_envs, dtype=np.int64)
-        self._distance = np.full(self.num_envs, np.inf)
+        self._everyone = np.arange(self.num_envs)
+        #: Variates of the episodes, in halves (:func:`slipcar.envs.episode.halves`).
+        self._half = halves(base.nodes - 1)
+        self._noise = self._room_for_noise(self._half, self.substeps, base.noise_dim)
+        #: States, (5, num_envs), and the same as increments and observations take them.
+        self._x = self._worlds.start.copy()
+        self._rounded = self._x.astype(self._dtype)
+        self._step = np.zeros(self.num_envs, dtype=np.int64)
+        #: The step that all are at, or None where they differ.
+        self._common_step: int | None = 0
+        self._distance = np.full(self.num_envs, np.inf, dtype=self._dtype)
         self._over = np.ones(self.num_envs, dtype=bool)
+        self._no_truncation = np.zeros(self.num_envs, dtype=bool)
+        self._film: Any = None
+
+    # ------------------------------------------------------------------------------- worlds
+
+    @property
+    def observation(self) -> str:
+        """Kind of observation."""
+        return self.layout.kind
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario that all share; of a family, what all its worlds share."""
+        return base_of(self._sources[0]) if len(self._sources) == 1 else self.scenarios[0]
+
+    @property
+    def scenarios(self) -> list[Scenario]:
+        """The world that each sub-environment is in, `num_envs` of them."""
+        if self._worlds.shared is not None:
+            return [self._worlds.shared] * self.num_envs
+        bases = [base_of(source) for source in self._sources]
+        return [self._worlds.scenario(i, bases[s]) for i, s in enumerate(self._source_of)]
+
+    @property
+    def states(self) -> np.ndarray:
+        """The cars' states, (num_envs, 5) [m, m, rad, m/s, rad/s]."""
+        return self._x.T.copy()
+
+    # ------------------------------------------------------------------------------- resets
 
     def reset(
         self,
         *,
-        seed: int | list[int | None] | None = None,
+        seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start episodes in all sub-environments, or in those of `options["reset_mask"]`.
@@ -90,45 +159,133 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Args:
             seed: None keeps the generators (or seeds them from the system at first), an int
                 seeds sub-environment i with `seed + i`, a list gives one seed each.
-            options: `reset_mask`, a (num_envs,) bool array with at least one True.
+            options: `reset_mask`, a (num_envs,) bool array with at least one True; `scenario`,
+                as the argument of that name or a list of `num_envs` of them, for those that
+                are reset, until another is given; `noise`, standard normal variates
+                (num_envs, N − 1, substeps, 3 + p) of these episodes, in place of drawn ones.
 
         Raises:
-            ValueError: for an unknown option, a bad mask or a list of the wrong length.
+            ValueError: for an unknown option, a bad value of one, or a list of the wrong length.
         """
-        options = dict(options or {})
-        mask = options.pop("reset_mask", None)
-        if options:
-            raise ValueError(f"unknown reset options {sorted(options)}; known is 'reset_mask'")
+        mask, given, noise = read_options(options, ("reset_mask", "scenario", "noise"))
+        here = self._masked(mask)
+        seeds = seeds_of(seed, self.num_envs)
+        if given is not None:
+            self._take_sources(here, given)
+        for i in here:
+            if (own := seeds[i]) is not None:
+                self._tapes.seed(int(i), own)
+        self._ready = True
+        self._start(here)
+        if noise is not None:
+            self._give_noise(here, noise)
+        _, distance, rims = self._proximity()
+        started = np.zeros(self.num_envs, dtype=bool)
+        started[here] = True
+        if self.render_mode is not None:
+            self._record(here)
+        return self._observe(rims), self._info_at_start(distance, started)
+
+    def _masked(self, mask: Any) -> np.ndarray:
         if mask is None:
-            mask = np.ones(self.num_envs, dtype=bool)
+            return self._everyone
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(
                 f"reset_mask must be a bool array of shape ({self.num_envs},) with at least one "
                 f"True, not {mask.dtype} of shape {mask.shape}"
             )
-        if isinstance(seed, (int, np.integer)):
-            seed = [int(seed) + i for i in range(self.num_envs)]
-        if seed is not None and np.asarray(seed, dtype=object).shape != (self.num_envs,):
-            raise ValueError(f"seed must be None, an int or {self.num_envs} of them, not {seed!r}")
-        if seed is not None:
-            for i in np.flatnonzero(mask):
-                if seed[i] is not None:
-                    self._rngs[i] = seeding.np_random(seed[i])[0]
-        self._ready = True
-        self._start_episodes(mask)
-        return self._observe(), self._info_at_start(mask)
+        return np.flatnonzero(mask)
 
-    def _start_episodes(self, mask: np.ndarray) -> None:
-        for i in np.flatnonzero(mask):
-            rng = self._rngs[i]
-            if rng is None:  # never seeded: from the system's entropy
-                rng = self._rngs[i] = seeding.np_random()[0]
-            self._noise[:, i] = draw_noise(rng, self.scenario, self.substeps)
-        self._x[mask] = self.scenario.start
-        self._steps[mask] = 0
-        self._distance[mask] = self.scenario.signed_distance(self.scenario.start)
-        self._over[mask] = False
+    def _take_sources(self, here: np.ndarray, given: Any) -> None:
+        """Let the sub-environments `here` draw from what the option `scenario` says."""
+        if isinstance(given, (list, tuple)):
+            if len(given) != self.num_envs:
+                raise ValueError(
+                    f"scenario must be one or a list of {self.num_envs}, not of {len(given)}"
+                )
+            sources = [source_of(value) for value in given]
+        else:
+            sources = [source_of(given)] * self.num_envs
+        for source in {id(source): source for source in sources}.values():
+            check_source(self.layout, self.single_observation_space, source)
+        chosen = [self._sources[s] for s in self._source_of]
+        for i in here:
+            chosen[i] = sources[i]
+        distinct = {id(source): source for source in chosen}
+        number = {key: n for n, key in enumerate(distinct)}
+        self._sources = list(distinct.values())
+        self._source_of = np.array([number[id(source)] for source in chosen])
+
+    def _start(self, here: np.ndarray) -> None:
+        """New episodes in the sub-environments `here` (indices)."""
+        for number, source in enumerate(self._sources):
+            if len(self._sources) == 1:
+                self._start_from(source, here)
+            else:
+                some = here[self._source_of[here] == number]
+                if len(some):
+                    self._start_from(source, some)
+        self._step[here] = 0
+        self._distance[here] = np.inf
+        self._over[here] = False
+        together = len(here) == self.num_envs or bool((self._step == 0).all())
+        self._common_step = 0 if together else None
+
+    def _start_from(self, source: Source, here: np.ndarray) -> None:
+        base, worlds = base_of(source), self._worlds
+        words = self._tapes.take(here, words_for_episode(source, self.substeps))
+        alike = len(here) == self.num_envs and isinstance(source, Scenario)
+        if alike:
+            shape = (halves(base.nodes - 1), self.substeps, base.noise_dim)
+            if self._noise.shape[2:] != shape:
+                self._noise = self._room_for_noise(*shape)
+            self._half = shape[0]
+        episodes = read_episodes(source, words, self.substeps, self._noise if alike else None)
+        if worlds.shared is not source:
+            if alike:
+                worlds.share(base)
+            else:
+                worlds.put(here, source, episodes.drawn)
+        if not alike:
+            self._keep_noise(here, episodes.noise, base)
+        start = worlds.start[:, here]
+        if episodes.deviations is not None:
+            start = start + base.start_deviation[:, None] * episodes.deviations.T
+        self._x[:, here] = start
+        self._rounded[:, here] = start
+
+    def _keep_noise(self, here: np.ndarray, noise: np.ndarray, base: Scenario) -> None:
+        """Put the noise of some beside that of the others, which may be longer or wider."""
+        old = self._noise
+        columns = 3 + len(self._worlds.parameters.process)
+        steps = base.nodes - 1
+        half = max(self._half, noise.shape[2])
+        if old.shape[2:] != (half, self.substeps, columns):
+            self._noise = self._room_for_noise(half, self.substeps, columns)
+            whole = np.concatenate(list(old), axis=1)
+            self._half = half
+            for k in range(min(whole.shape[1], 2 * half)):
+                self._noise[k // half, :, k % half, :, : old.shape[4]] = whole[:, k]
+        wanted = self._worlds.noise_columns(base)
+        whole = np.concatenate(list(noise), axis=1)
+        for k in range(steps):
+            self._noise[k // half, here[:, None], k % half, :, wanted] = np.moveaxis(
+                whole[:, k], 2, 0
+            ).swapaxes(0, 1)
+
+    def _give_noise(self, here: np.ndarray, noise: Any) -> None:
+        half = self._half
+        steps = int(self._worlds.steps.max())
+        shape = (self.num_envs, steps, self.substeps, self._noise.shape[4])
+        given = checked_array("noise", noise, shape)
+        for k in range(steps):
+            self._noise[k // half, here, k % half] = given[here, k]
+
+    def _room_for_noise(self, half: int, substeps: int, columns: int) -> np.ndarray:
+        return np.zeros((2, self.num_envs, half, substeps, columns), dtype=np.float32)
+
+    # -------------------------------------------------------------------------------- steps
 
     def step(
         self, actions: np.ndarray
@@ -141,93 +298,172 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         if not self._ready:
             raise ResetNeeded("call reset() before step()")
-        resetting = self._over
-        if self.autoreset_mode is AutoresetMode.DISABLED and resetting.any():
+        resetting = np.flatnonzero(self._over)
+        if self.autoreset_mode is AutoresetMode.DISABLED and len(resetting):
             raise ResetNeeded(
-                f"sub-environments {np.flatnonzero(resetting).tolist()} are over: reset them "
+                f"sub-environments {resetting.tolist()} are over: reset them "
                 "with options={'reset_mask': ...} before step()"
             )
-        u = control_from_action(self.scenario, actions, (self.num_envs,))
-        if resetting.any():  # NEXT_STEP: this call starts their episodes and ignores the action
-            started = resetting.copy()
-            self._start_episodes(started)
-            running = ~started
+        actions = checked_action(actions, (self.num_envs,), self._dtype)
+        limited = np.maximum(actions, -1.0)
+        np.minimum(limited, 1.0, out=limited)
+        u = np.empty((2, self.num_envs), dtype=self._dtype)
+        np.multiply(limited.T, self._worlds.action_scale, out=u)
+        if len(resetting):  # NEXT_STEP: this call starts their episodes and ignores the action
+            self._start(resetting)
+        if len(resetting) == self.num_envs:
+            moved = self._stay()
+            u[:] = 0.0
         else:
-            started, running = None, None
-        noise = self._noise_now()
-        moved = transition(self.scenario, self._x, u, noise)
-        effort, obstacle = moved.effort, moved.obstacle
-        if running is None:
-            self._x = moved.state
-            self._steps += 1
-            np.minimum(self._distance, moved.distance, out=self._distance)
-        else:
-            self._x[running] = moved.state[running]
-            self._steps[running] += 1
-            self._distance[running] = np.minimum(self._distance, moved.distance)[running]
-            effort, obstacle = np.where(running, effort, 0.0), np.where(running, obstacle, 0.0)
-            u[started] = 0.0
-        over = self._steps == self.scenario.nodes - 1
-        if self.terminate_on_collision:
-            over |= self._distance < 0.0
-            if started is not None:
-                over &= running
-        self._over = over.copy()  # _start_episodes writes to it
-        any_over = bool(over.any())
+            moved = self._move(u, resetting)
+        over = self._ended(resetting)
         goal = np.zeros(self.num_envs)
-        if any_over:
-            goal[over] = self.scenario.goal_cost(self._x[over])
-        info = self._info(u, effort, obstacle, goal)
-        reward = -(effort + obstacle + goal)
-        observation = self._observe()
-        if any_over and self.autoreset_mode is AutoresetMode.SAME_STEP:
-            final = np.full(self.num_envs, None, dtype=object)
-            for i in np.flatnonzero(over):
-                final[i] = observation[i].copy()
-            self._start_episodes(over)
-            fresh = self._info_at_start(over)
-            info = {
-                **{k: _choose(over, fresh[k], info[k]) for k in info},
-                "final_obs": final,
-                "_final_obs": over.copy(),
-                "final_info": {k: _masked(over, info[k]) for k in info},
-                "_final_info": over.copy(),
-            }
-            observation = self._observe()
-        return observation, reward, over, np.zeros(self.num_envs, dtype=bool), info
+        success = np.zeros(self.num_envs, dtype=bool)
+        ended = np.flatnonzero(over)
+        if len(ended):
+            goal[ended] = goal_cost(self._worlds.parameters, self._x)[ended]
+            success[ended] = self._arrived()[ended]
+        self._over = over.copy()  # _start writes to it
+        info = self._info(u, moved, goal, success)
+        # In float64, so that the return is minus the sum of the costs that `info` tells of.
+        reward = np.add(moved.effort, moved.obstacle, dtype=np.float64)
+        if len(ended):
+            reward += goal
+        np.negative(reward, out=reward)
+        observation = self._observe(moved.rims)
+        if self.render_mode is not None:
+            self._record(resetting)
+        if len(ended) and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            observation, info = self._restart(ended, over, observation, info)
+        return observation, reward, over, self._no_truncation.copy(), info
+
+    def _move(self, u: np.ndarray, resetting: np.ndarray) -> Moved:
+        """Step all but those that have just been reset."""
+        before = self._x[:, resetting]
+        moved = step(
+            self._worlds.parameters, self._rounded, u, self._noise_now(), ARRAYS, self._add
+        )
+        self._step += 1
+        if self._common_step is not None:
+            self._common_step += 1
+        if len(resetting):
+            self._x[:, resetting] = self._rounded[:, resetting] = before
+            self._step[resetting] = 0
+            self._common_step = None
+            u[:, resetting] = 0.0
+            moved.effort[resetting] = moved.obstacle[resetting] = 0.0
+            _, distance, rims = self._proximity()
+            moved = moved._replace(distance=distance, rims=rims)
+            far = moved.distance.copy()
+            far[resetting] = np.inf
+            np.minimum(self._distance, far, out=self._distance)
+        else:
+            np.minimum(self._distance, moved.distance, out=self._distance)
+        return moved
+
+    def _add(self, x: Any, added: list[np.ndarray]) -> np.ndarray:
+        for row, change in zip(self._x, added, strict=True):
+            row += change
+        self._rounded = self._x.astype(self._dtype)
+        return self._rounded
+
+    def _stay(self) -> Moved:
+        """All have just been reset."""
+        nothing = np.zeros(self.num_envs, dtype=self._dtype)
+        _, distance, rims = self._proximity()
+        return Moved(self._rounded, nothing, nothing, distance, rims)
+
+    def _proximity(self) -> tuple[Any, Any, list[Any]]:
+        return proximity(self._worlds.parameters, self._rounded, ARRAYS)
 
     def _noise_now(self) -> np.ndarray:
-        first = self._steps[0]
-        if (self._steps == first).all():  # always, unless episodes end at collisions
-            return self._noise[first]
-        return self._noise[self._steps, np.arange(self.num_envs)]
+        """Variates of this step, indexed [substep, component, car]."""
+        if self._common_step is not None:
+            half, k = divmod(self._common_step, self._half)
+            now = self._noise[half, :, k]
+        else:
+            half, k = np.divmod(np.minimum(self._step, 2 * self._half - 1), self._half)
+            now = self._noise[half, self._everyone, k]
+        return np.ascontiguousarray(now.transpose(1, 2, 0), dtype=self._dtype)
 
-    def _observe(self) -> np.ndarray:
-        t = self._steps * self.scenario.dt
-        return layouts.observe(self.scenario, self.observation, t, self._x)
+    def _ended(self, resetting: np.ndarray) -> np.ndarray:
+        over = self._step == self._worlds.steps
+        if self.terminate_on_collision:
+            over |= self._distance < 0.0
+        if len(resetting):
+            over[resetting] = False
+        return over
 
-    def _info_at_start(self, here: np.ndarray) -> dict[str, Any]:
-        nothing = np.zeros(self.num_envs)
-        return self._info(np.zeros((self.num_envs, 2)), nothing, nothing, nothing, here)
+    def _arrived(self) -> np.ndarray:
+        worlds = self._worlds
+        close = arrived(self._x, worlds.parameters.goal, worlds.tolerance)
+        return close & (self._distance >= 0.0) & (self._step == worlds.steps)
+
+    def _restart(
+        self, ended: np.ndarray, over: np.ndarray, observation: np.ndarray, info: dict[str, Any]
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """SAME_STEP: start the next episodes and hand on how the last ones ended."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for i, last in zip(ended, observation[ended], strict=True):
+            final[i] = last
+        self._start(ended)
+        if self.render_mode is not None:
+            self._record(ended)
+        _, distance, rims = self._proximity()
+        fresh = self._info_at_start(distance, over)
+        info = {
+            **{k: _choose(over, fresh[k], info[k]) for k in info},
+            "final_obs": final,
+            "_final_obs": over.copy(),
+            "final_info": {k: _masked(over, info[k]) for k in info},
+            "_final_info": over.copy(),
+        }
+        return self._observe(rims), info
+
+    # ------------------------------------------------------------------------- what is seen
+
+    def _observe(self, rims: Any) -> np.ndarray:
+        p, k = self._worlds.parameters, self._common_step
+        t = p.dt * (self._step if k is None else k)
+        if isinstance(t, np.ndarray):
+            t = t.astype(self._dtype, copy=False)
+        seen = layouts.entries(self.layout, p, t, self._rounded, rims, ARRAYS)
+        out = np.empty((self.num_envs, self.layout.size), dtype=np.float32)
+        for i, entry in enumerate(seen):
+            out[:, i] = entry
+        return out
+
+    def _info_at_start(self, distance: np.ndarray, here: np.ndarray) -> dict[str, Any]:
+        nothing = np.zeros(self.num_envs, dtype=self._dtype)
+        still = Moved(self._rounded, nothing, nothing, distance, [])
+        never = np.zeros(self.num_envs, dtype=bool)
+        return self._info(np.zeros((2, self.num_envs)), still, nothing, never, here)
 
     def _info(
         self,
         u: np.ndarray,
-        effort: np.ndarray,
-        obstacle: np.ndarray,
+        moved: Moved,
         goal: np.ndarray,
+        success: np.ndarray,
         here: np.ndarray | None = None,
     ) -> dict[str, Any]:
+        collision, clearance = self._distance < 0.0, self._distance.copy()
+        inside = moved.distance < 0.0
+        if self._common_step is None or self._common_step == 0:
+            fresh = self._step == 0
+            clearance[fresh], inside[fresh] = moved.distance[fresh], False
         values = {
-            "effort": effort,
-            "obstacle": obstacle,
+            "effort": moved.effort,
+            "obstacle": moved.obstacle,
             "goal": goal,
-            "collision": self._distance < 0.0,
-            "clearance": self._distance.copy(),
-            "control": u,
+            "cost": inside.astype(self._dtype),
+            "collision": collision,
+            "clearance": clearance,
+            "control": u.T,
+            "is_success": success,
         }
-        here = np.ones(self.num_envs, dtype=bool) if here is None else here
-        return {**values, **{f"_{name}": here.copy() for name in values}}
+        there = np.ones(self.num_envs, dtype=bool) if here is None else here.copy()
+        return values | dict.fromkeys(_MASKS, there)
 
 
 def _choose(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -18,7 +18,9 @@ SHORT = PAPER.replace(nodes=6)
 
 
 def adapter(num_envs, scenario=PAPER, reward_scale=1.0, **options):
-    env = SlipCarVectorEnv(num_envs, scenario, autoreset_mode="SameStep", **options)
+    env = SlipCarVectorEnv(
+        num_envs, scenario, autoreset_mode="SameStep", dtype="float64", **options
+    )
     return SB3VecEnv(env, reward_scale)
 
 
@@ -65,7 +67,7 @@ def test_steps_like_dummy_vec_env_over_single_environments(terminate_on_collisio
 def test_episode_end_hands_over_the_observation_before_the_reset():
     n = 7
     ours = adapter(n, SHORT)
-    plain = SlipCarVectorEnv(n, SHORT, autoreset_mode="Disabled")
+    plain = SlipCarVectorEnv(n, SHORT, autoreset_mode="Disabled", dtype="float64")
     ours.seed(3)
     ours.reset(), plain.reset(seed=3)
     for actions in random_actions(5, n):

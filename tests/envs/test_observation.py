@@ -105,7 +105,7 @@ def test_layouts_name_every_entry():
 
 @pytest.mark.parametrize("kind", ["feature", "", None, 3])
 def test_unknown_kinds_list_the_known_ones(kind):
-    message = r"unknown observation .*the kinds are \['features', 'state'\]"
+    message = r"unknown observation .*the kinds are \['features', 'state', 'egocentric'\]"
     for call in (
         lambda: observation_space(PAPER, kind),
         lambda: observe(PAPER, kind, 0.0, np.zeros(5)),
@@ -115,7 +115,7 @@ def test_unknown_kinds_list_the_known_ones(kind):
             call()
 
 
-@pytest.mark.parametrize("shape", [(), (5,), (6, 7), (3, 0)])
+@pytest.mark.parametrize("shape", [(), (5,), (6, 9), (3, 0)])
 def test_what_is_no_observation_cannot_be_decoded(shape):
-    with pytest.raises(ValueError, match=r"12 entries \(features\) or 6 \(state\)"):
+    with pytest.raises(ValueError, match=r"12 \(features\) or 6 \(state\) or 15 \(egocentric\)"):
         decode(PAPER, np.zeros(shape))

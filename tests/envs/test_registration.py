@@ -48,7 +48,7 @@ def test_gymnasiums_own_vector_environments_agree_with_the_native_one(mode):
     """`async` starts its workers with spawn, which imports everything afresh."""
     vector_kwargs = {"context": "spawn"} if mode == "async" else {}
     theirs = gym.make_vec(ENV_ID, 2, vectorization_mode=mode, vector_kwargs=vector_kwargs)
-    ours = gym.make_vec(ENV_ID, 2, vectorization_mode="vector_entry_point")
+    ours = gym.make_vec(ENV_ID, 2, vectorization_mode="vector_entry_point", dtype="float64")
     try:
         rng = np.random.default_rng(0)
         np.testing.assert_array_equal(theirs.reset(seed=8)[0], ours.reset(seed=8)[0])

@@ -248,8 +248,16 @@ def test_unknown_names_list_the_known_ones(name):
 
 
 def test_only_scenarios_and_names_are_scenarios():
-    with pytest.raises(ValueError, match=r"a Scenario or one of the names \['paper'.* not dict"):
-        Scenario.of({"start": 0})
+    with pytest.raises(ValueError, match=r"a Scenario, one of the names \['paper'.* not tuple"):
+        Scenario.of((0, 1))
+    with pytest.raises(ValueError, match=r"missing fields \['goal'\]"):
+        Scenario.of({"start": np.zeros(5)})
+
+
+@pytest.mark.parametrize("name", Scenario.names())
+def test_a_scenario_is_also_known_by_its_data_and_text(name):
+    scenario = Scenario.named(name)
+    assert Scenario.of(scenario.to_dict()) == Scenario.of(scenario.to_json()) == scenario
 
 
 @pytest.mark.parametrize(

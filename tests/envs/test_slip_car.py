@@ -10,9 +10,9 @@ from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 
 from slipcar.envs import Scenario, SlipCarEnv, cost
+from slipcar.envs.episode import draw_episode
 from slipcar.envs.integrate import euler_maruyama
 from slipcar.envs.observation import KINDS
-from slipcar.envs.transition import draw_noise
 
 ENV_ID = "slipcar.envs:SlipCar-v0"
 PAPER = Scenario.named("paper")
@@ -41,7 +41,7 @@ def random_actions(scenario, seed, forward=0.0):
 
 def path_of(scenario, controls, seed, substeps):
     """The states (N, 5) that seed and controls must lead to, integrated here."""
-    noise = draw_noise(seeding.np_random(seed)[0], scenario, substeps)
+    noise = draw_episode(seeding.np_random(seed)[0], scenario, substeps).noise
     states = [scenario.start]
     for u, z in zip(controls, noise, strict=False):
         states.append(euler_maruyama(states[-1], u, scenario.dt, z, scenario.slip))
@@ -221,7 +221,7 @@ def test_actions_are_clipped_to_the_bounds():
     ("arguments", "message"),
     [
         ({"scenario": "papre"}, r"unknown scenario 'papre'; the named ones are \['paper'"),
-        ({"scenario": 3}, r"a Scenario or one of the names \['paper'.*, not int"),
+        ({"scenario": 3}, r"a Scenario, one of the names \['paper'.*, not int"),
         ({"observation": "pixels"}, r"unknown observation 'pixels'; the kinds are \['features'"),
         ({"substeps": 0}, "substeps must be at least 1, not 0"),
         ({"substeps": 1.5}, "substeps must be an integer at least 1, not 1.5"),
@@ -270,7 +270,9 @@ def test_steps_need_a_running_episode():
 
 
 def test_unknown_reset_options_are_refused():
-    with pytest.raises(ValueError, match=r"unknown reset options \['start'\]; none are known"):
+    with pytest.raises(
+        ValueError, match=r"unknown reset options \['start'\]; known are \['scenario', 'noise'\]"
+    ):
         SlipCarEnv().reset(options={"start": 0})
 
 

@@ -1,0 +1,170 @@
+"""The worlds of a fleet: which scenario each car drives in, as numbers side by side.
+
+Where all cars share one scenario its numbers are floats, and a step costs no more for knowing
+them. Where they differ each number is an array with one entry per car.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from slipcar.envs.families import Draw, Family
+from slipcar.envs.parameters import Parameters
+from slipcar.envs.scenario import Scenario
+
+#: What an environment draws its episodes' worlds from.
+Source: TypeAlias = Scenario | Family
+
+#: An obstacle that is not there: x, y, radius and reach of one infinitely far away.
+_ABSENT = (1e9, 1e9, -np.inf, 0.0)
+
+
+def source_of(value: Any) -> Source:
+    """A scenario or a family from itself, a name, JSON text or plain data.
+
+    Raises:
+        ValueError: for anything else, listing the names.
+    """
+    if isinstance(value, (Scenario, Family)):
+        return value
+    if isinstance(value, str) and value.startswith("family:"):
+        return Family.named(value.removeprefix("family:"))
+    return Scenario.of(value)
+
+
+def base_of(source: Source) -> Scenario:
+    """A scenario with what all worlds of a source share."""
+    return source.base if isinstance(source, Family) else source
+
+
+def most_obstacles(source: Source) -> int:
+    """How many obstacles a world of the source may have."""
+    return source.obstacles[1] if isinstance(source, Family) else len(source.obstacles)
+
+
+def longest_horizon(source: Source) -> float:
+    """The longest horizon of a world of the source [s]."""
+    return source.horizon[1] if isinstance(source, Family) else source.horizon
+
+
+def words_for_world(source: Source) -> int:
+    """Random words that drawing a world takes."""
+    return source.words if isinstance(source, Family) else 0
+
+
+class Worlds:
+    """One world for each of `count` cars.
+
+    Attributes:
+        shared: the scenario of all, or None where they differ.
+        parameters: the numbers of a step; arrays (count,) where cars differ.
+        steps: control steps of an episode, (count,).
+
+    Args:
+        count: how many cars.
+        dtype: of the arrays in `parameters`.
+        scenario: what all begin with.
+    """
+
+    def __init__(self, count: int, dtype: type, scenario: Scenario) -> None:
+        self._count, self._dtype = count, dtype
+        self.share(scenario)
+
+    def share(self, scenario: Scenario) -> None:
+        """Put all cars into one scenario."""
+        self.shared: Scenario | None = scenario
+        self.parameters = Parameters.like(np.empty(self._count, dtype=self._dtype), scenario)
+        self.steps = np.full(self._count, scenario.nodes - 1)
+        self.start = np.repeat(scenario.start[:, None], self._count, axis=1)
+        self.start_deviation = scenario.start_deviation[:, None]
+        self.tolerance = scenario.goal_tolerance[:, None]
+        self.action_scale = scenario.action_scale[:, None].astype(self._dtype)
+
+    def put(self, here: np.ndarray, source: Source, drawn: Draw | None) -> None:
+        """Put the cars `here` (indices) into a scenario, or into worlds drawn from a family."""
+        base = base_of(source)
+        self._part(most_obstacles(source), {i for i, _ in base.process})
+        p = self.parameters
+        nodes = base.nodes
+        horizon = base.horizon if drawn is None else drawn.horizon
+        p.horizon[here] = horizon
+        p.dt[here] = horizon / (nodes - 1)
+        self.steps[here] = nodes - 1
+        slip = base.slip[:, None] if drawn is None else drawn.slip.T
+        start = base.start[:, None] if drawn is None else drawn.start.T
+        goal = base.goal[:, None] if drawn is None else drawn.goal.T
+        for i in range(2):
+            p.slip[i][here] = slip[i]
+        for i in range(5):
+            p.goal[i][here], p.goal_weight[i][here] = goal[i], base.goal_weight[i]
+        for i, deviation in p.process:
+            deviation[here] = base.process_noise[i]
+        self.start[:, here] = start
+        self.start_deviation[:, here] = base.start_deviation[:, None]
+        self.tolerance[:, here] = base.goal_tolerance[:, None]
+        self.action_scale[:, here] = base.action_scale[:, None]
+        p.obstacle_weight[here] = base.obstacle_weight
+        obstacles = base.obstacles[None] if drawn is None else drawn.obstacles
+        count = np.array([len(base.obstacles)]) if drawn is None else drawn.count
+        k = obstacles.shape[1]
+        x, y, radius = np.moveaxis(obstacles, -1, 0)
+        there = np.arange(k) < count[:, None]
+        for column, value, absent in zip(
+            p.obstacles, (x, y, radius, radius + base.clearance), _ABSENT, strict=True
+        ):
+            column[:k, here] = np.where(there, value, absent).T
+            column[k:, here] = absent
+
+    def scenario(self, i: int, base: Scenario) -> Scenario:
+        """The world of car i as a scenario; what a family does not vary comes from `base`."""
+        if self.shared is not None:
+            return self.shared
+        p = self.parameters
+        rows = np.stack([column[:, i] for column in p.obstacles[:3]], axis=-1).astype(float)
+        return base.replace(
+            start=self.start[:, i],
+            goal=[goal[i] for goal in p.goal],
+            horizon=float(p.horizon[i]),
+            slip=[slip[i] for slip in p.slip],
+            obstacles=rows[np.isfinite(rows[:, 2])],
+        )
+
+    def noise_columns(self, base: Scenario) -> list[int]:
+        """Where the variates of a scenario's noise belong among those of the fleet's."""
+        reached = [i for i, _ in self.parameters.process]
+        return [0, 1, 2, *(3 + reached.index(i) for i, _ in base.process)]
+
+    def _part(self, obstacles: int, process: set[int]) -> None:
+        """Numbers of its own for every car, with room for obstacles and process noise."""
+        shared = self.shared
+        count, dtype = self._count, self._dtype
+
+        def array(value: float) -> np.ndarray:
+            return np.full(count, value, dtype=dtype)
+
+        if shared is not None:
+            p = self.parameters
+            self.parameters = Parameters(
+                dt=array(p.dt),
+                horizon=array(p.horizon),
+                slip=[array(s) for s in p.slip],
+                process=tuple((i, array(value)) for i, value in p.process),
+                obstacles=tuple(np.repeat(column, count, axis=1) for column in p.obstacles),
+                obstacle_weight=array(p.obstacle_weight),
+                goal=[array(g) for g in p.goal],
+                goal_weight=[array(w) for w in p.goal_weight],
+            )
+            for name in ("start_deviation", "tolerance", "action_scale"):
+                setattr(self, name, np.repeat(getattr(self, name), count, axis=1))
+            self.shared = None
+        p = self.parameters
+        missing = max(0, obstacles - len(p.obstacles[0]))
+        absent = [np.full((missing, count), value, dtype=dtype) for value in _ABSENT]
+        known = dict(p.process)
+        reached = {i: known.get(i, array(0.0)) for i in sorted(process | set(known))}
+        self.parameters = p._replace(
+            obstacles=tuple(np.concatenate(pair) for pair in zip(p.obstacles, absent, strict=True)),
+            process=tuple(reached.items()),
+        )

@@ -1,0 +1,70 @@
+"""What an environment is told when it is made and reset, checked once for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gymnasium.spaces import Box
+
+from slipcar.envs.families import Family
+from slipcar.envs.fleet import Source, base_of, longest_horizon, most_obstacles
+from slipcar.envs.observation import Layout
+
+
+def layout_for(source: Source, kind: str, slots: int | None) -> Layout:
+    """The observation of an environment with these arguments.
+
+    Raises:
+        ValueError: for an unknown kind, a bad number of slots, or fewer than obstacles.
+    """
+    if slots is None:
+        slots = most_obstacles(source) if isinstance(source, Family) else 0
+    layout = Layout(kind, slots)
+    check_slots(layout, source)
+    return layout
+
+
+def check_slots(layout: Layout, source: Source) -> None:
+    """Raises ValueError if a world may have more obstacles than an observation with slots shows."""
+    most = most_obstacles(source)
+    if 0 < layout.slots < most:
+        raise ValueError(
+            f"the {_name(source)} has up to {most} obstacles and the observation shows "
+            f"{layout.slots}: pass obstacle_slots={most} or more when the environment is made, "
+            "or 0 to show none"
+        )
+
+
+def check_source(layout: Layout, space: Box, source: Source) -> None:
+    """Check that worlds of a source can be seen by an environment that is there already.
+
+    Raises:
+        ValueError: if they have more obstacles than slots, a longer horizon than the observation
+            space allows for, or no control bounds.
+    """
+    check_slots(layout, source)
+    horizon = longest_horizon(source)
+    if layout.kind == "state" and horizon > space.high[5]:
+        raise ValueError(
+            f"the {_name(source)} lasts {horizon:g} s, longer than the {space.high[5]:g} s that "
+            "the observation space allows for: pass it when the environment is made"
+        )
+    base_of(source).action_scale  # noqa: B018  raises if unbounded
+
+
+def read_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> list[Any]:
+    """The values of the known options, None where one is not given.
+
+    Raises:
+        ValueError: for an unknown one.
+    """
+    given = dict(options or {})
+    values = [given.pop(name, None) for name in known]
+    if given:
+        raise ValueError(f"unknown reset options {sorted(given)}; known are {list(known)}")
+    return values
+
+
+def _name(source: Source) -> str:
+    return "family" if isinstance(source, Family) else "scenario"
