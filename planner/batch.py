@@ -106,7 +106,7 @@ def plan_batch(
         with _naming(_LABEL, i):
             x, u = model.guess() if given is None else given_guess(model, given)
             if initial_states is None or i == 0:
-                checks.check_once(model, x, u)
+                checks.check_once(model, x, u, charged=chosen.variance_weight > 0)
         own = given is None and chosen.method != "convex" and not chosen.only_convex
         first = own if free_first is None else bool(free_first)
         tasks.append(Task(model, x, u, first))
@@ -187,7 +187,7 @@ def _together(
     if all(
         getattr(model, name) is getattr(models[0], name)
         for model in models
-        for name in ("times", "R", "lower", "upper", "weight")
+        for name in ("times", "R", "lower", "upper", "weight", "start_covariance")
     ):
         models = models[:1]
     answers = fast.run(

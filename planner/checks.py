@@ -2,8 +2,10 @@
 
 * shapes: every function answers (K, ...) for K points;
 * b affine in u (paper §2): second differences in u vanish;
-* σ depends on no state that the noise reaches (paper §6.1, "z"): a state is reached if its row
-  of σ is not zero, or if its drift depends on a reached one;
+* σ depends on no uncertain state (paper §6.1, "z"), where the variance is charged: a state is
+  uncertain if its start is, if its row of σ is not zero, or if its drift depends on an uncertain
+  one. The adjoint weights of the penalty leave out how σ then spreads with Σ; covariances and
+  expected costs do not (:mod:`.moments`, :mod:`.expected.belief`), and need no such thing;
 * on request, every Jacobian against differences: this finds wrong analytic ones, and complex
   steps through functions that are not analytic (abs, conj, ...).
 
@@ -30,20 +32,42 @@ _PATTERN, _SIGMA, _AFFINE, _JACOBIAN = 1e-12, 1e-9, 1e-7, 1e-5
 _quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-#: Problems that passed.
+#: Problems that passed, and what was found out about their diffusion.
 _PASSED = Recent()
 
 
-def check_once(model: Model, x: Array, u: Array) -> None:
-    """:func:`check_assumptions`, unless this very (immutable) problem has passed it lately."""
-    if _PASSED.get(model.problem) is None:
-        check_assumptions(model, x, u)
-        _PASSED.keep(model.problem, True)
+def check_once(model: Model, x: Array, u: Array, *, charged: bool) -> None:
+    """:func:`check_assumptions`, unless this very (immutable) problem has passed it lately.
+
+    Args:
+        model: the problem.
+        x: states of the guess, (N, n).
+        u: its controls, (N−1, m).
+        charged: whether `variance_weight` is to charge the noise.
+
+    Raises:
+        ValueError: naming the function, the entry and what is assumed of it.
+    """
+    found = _PASSED.get(model.problem)
+    if found is None:
+        found = check_assumptions(model, x, u)
+        _PASSED.keep(model.problem, found)
+    if charged and found:
+        raise ValueError(
+            f"{found}. variance_weight (1 unless told otherwise) charges the noise with σ at the "
+            f"mean, which holds only if σ depends on states that stay deterministic (paper §6.1). "
+            f"Plan with expected=True, feedback=True or risk=..., whose covariance counts what "
+            f"noisy states do to σ, or with variance_weight=0"
+        )
 
 
 @_quiet
-def check_assumptions(model: Model, x: Array, u: Array) -> None:
-    """Shapes, affine controls and noise-free diffusion, near states x (N, n) and controls u.
+def check_assumptions(model: Model, x: Array, u: Array) -> str:
+    """Shapes and affine controls, near states x (N, n) and controls u.
+
+    Returns:
+        Which entry of the diffusion depends on which uncertain state, and why it is one; empty
+        if none does, as in the paper.
 
     Raises:
         ValueError: naming the function, the entry and what is assumed of it.
@@ -51,7 +75,7 @@ def check_assumptions(model: Model, x: Array, u: Array) -> None:
     t, y, v = _points(model, x, u)
     b, A, sigma, d_sigma = _checked_shapes(model, t, y, v)
     _check_affine(model, t, y, v, b)
-    _check_diffusion(y, A, sigma, d_sigma)
+    return _uncertain_diffusion(model, y, A, sigma, d_sigma)
 
 
 def _points(model: Model, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -124,17 +148,19 @@ def _check_affine(model: Model, t: Array, x: Array, u: Array, b: Array) -> None:
         )
 
 
-def _check_diffusion(x: Array, A: Array, sigma: Array, d_sigma: Array) -> None:
+def _uncertain_diffusion(model: Model, x: Array, A: Array, sigma: Array, d_sigma: Array) -> str:
     largest = np.nanmax(np.abs(sigma), initial=0.0)
     scale = 1.0 + np.abs(x).max(axis=0)
     moved = (np.abs(d_sigma) * scale > _SIGMA * largest).any(axis=0)  # (n, d, n)
     if largest == 0.0 or not moved.any():
-        return
+        return ""
     A = np.abs(A) * scale
     negligible = _PATTERN * A.max(axis=(1, 2), keepdims=True)
     depends = (negligible < A).any(axis=0)
     noisy = (sigma != 0.0).any(axis=(0, 2))
-    path = {int(i): f"x[{i}]" for i in np.flatnonzero(noisy)}
+    unknown = np.diag(model.start_covariance) > 0.0
+    path = {int(i): f"noise → x[{i}]" for i in np.flatnonzero(noisy)}
+    path |= {int(i): f"start → x[{i}]" for i in np.flatnonzero(unknown & ~noisy)}
     fresh = list(path)
     while fresh:
         fresh = [
@@ -147,13 +173,8 @@ def _check_diffusion(x: Array, A: Array, sigma: Array, d_sigma: Array) -> None:
         entries = np.argwhere(moved[:, :, j])
         if len(entries):
             row, column = (int(i) for i in entries[0])
-            raise ValueError(
-                f"diffusion[{row}, {column}] depends on x[{j}], which the noise reaches "
-                f"(noise → {path[j]}). The covariance is propagated with σ at the mean, which "
-                f"holds only if σ depends on states that stay deterministic (paper §6.1). Let σ "
-                f"depend on time or on states without noise: for example, take x[{j}] along a "
-                f"nominal path, which is right to first order in the noise"
-            )
+            return f"diffusion[{row}, {column}] depends on x[{j}], which is uncertain ({path[j]})"
+    return ""
 
 
 def _reach(path: dict[int, str], i: int, by: int) -> int:

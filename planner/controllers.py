@@ -14,8 +14,15 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.control_set import control_ball, control_limits, project_controls
-from slipcar.planner.feedback import default_tracking, lqr_gains, weight_matrix, wrap
+from slipcar.planner.feedback import (
+    closed_loop_covariance,
+    default_tracking,
+    lqr_gains,
+    weight_matrix,
+    wrap,
+)
 from slipcar.planner.plan import Plan
+from slipcar.planner.problem import model_of
 
 Array = np.ndarray
 
@@ -65,6 +72,19 @@ class OpenLoop:
         u = self.control(t, x)
         encode = getattr(self.plan.problem, "encode_control", None)
         return np.asarray(u if encode is None else encode(u), dtype=np.float32), None
+
+    def preview(self, state: Any = None, row: int = 0) -> tuple[Array, Array | None]:
+        """What it means to do, to be drawn: the whole plan, whatever has happened.
+
+        Args:
+            state: what `predict` returned.
+            row: which episode of those `predict` was asked for.
+
+        Returns:
+            Mean states (N, n), and the covariances (N, n, n) of the car driven so: open loop or,
+            with feedback, closed; None where they are not known.
+        """
+        return self.plan.mean, self.plan.covariance
 
     def fingerprint(self) -> str:
         """A hash of all that determines its actions."""
@@ -150,6 +170,17 @@ class Feedback(OpenLoop):
         # A sum over states rather than a matrix product: the same bits for any batch size.
         correction = (self.plan.gains[k] * error[..., None, :]).sum(axis=-1)
         return project_controls(self.plan.controls[k] + correction, *self._admissible)
+
+    def preview(self, state: Any = None, row: int = 0) -> tuple[Array, Array | None]:
+        """The plan and the covariances (N, n, n) of the closed loop; see `OpenLoop.preview`."""
+        plan = self.plan
+        assert plan.gains is not None
+        if plan.expected is not None:  # planned for its own gains
+            return plan.mean, plan.covariance
+        if plan.problem is None:
+            return plan.mean, None
+        model, along = model_of(plan.problem), (plan.times, plan.mean, plan.A, plan.B, plan.gains)
+        return plan.mean, closed_loop_covariance(model, *along, start=plan.covariance[0])
 
     def _numbers(self) -> list[Array]:
         assert self.plan.gains is not None

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from slipcar.planner.moments import covariance
+
+if TYPE_CHECKING:
+    from slipcar.planner.problem import Model
 
 Array = np.ndarray
 
@@ -39,6 +44,28 @@ def lqr_gains(A: Array, B: Array, dt: Array, Q: Array, R: Array, Qf: Array) -> A
         closed = A[k] + B[k] @ K[k]
         P = closed.T @ P @ closed + K[k].T @ Rk @ K[k] + (dt[k] * Q if k else 0.0)
     return K
+
+
+def closed_loop_covariance(
+    model: Model, times: Array, mean: Array, A: Array, B: Array, gains: Array, *, start: Array
+) -> Array:
+    """Σ along a plan that is followed with its gains; see :mod:`.moments`.
+
+    Args:
+        model: whose noise it is.
+        times: nodes, (N,) [s].
+        mean: (N, n).
+        A: ∂x⁺/∂x along it, (N−1, n, n).
+        B: ∂x⁺/∂u, (N−1, n, m).
+        gains: K, (N−1, m, n).
+        start: Σ at the first node, (n, n).
+
+    Returns:
+        (N, n, n).
+    """
+    at = times[:-1], mean[:-1]
+    sigma, d_sigma = np.asarray(model.diffusion(*at)), np.asarray(model.diffusion_jacobian(*at))
+    return covariance(A + B @ gains, sigma, np.diff(times), start=start, d_sigma=d_sigma)
 
 
 def wrap(error: Array, angles: Iterable[int]) -> Array:

@@ -223,7 +223,10 @@ class Replanner:
         self, tails: Tails, states: Array, controls: Array, interval: int
     ) -> tuple[Tails, Array]:
         times = self.model.times[interval:]
-        model = dataclasses.replace(self.model, times=times, dt=np.diff(times))
+        known = np.zeros_like(self.model.start_covariance)  # the state is observed
+        model = dataclasses.replace(
+            self.model, times=times, dt=np.diff(times), start_covariance=known
+        )
         found, ok = {name: np.array(getattr(tails, name)) for name in FIELDS}, []
         for i in range(len(tails)):
             warm: Any = _Warm(*(getattr(tails, f.name)[i] for f in dataclasses.fields(_Warm)))

@@ -247,7 +247,7 @@ def time_slope(model: Model, at: FirstOrder, adjoint: Array, variance_weight: fl
         lin = linearize(stretched, at.lin.x, at.lin.u)
         value = lin.effort + lin.penalty + lin.running + float(np.vdot(adjoint, lin.defect))
         if variance_weight > 0.0:
-            S = moments.covariance(lin.A, lin.sigma, stretched.dt)
+            S = moments.covariance_of(stretched, lin)
             value += variance_weight * moments.trace_integral(S, stretched.dt)
         return value
 

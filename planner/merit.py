@@ -41,7 +41,7 @@ class Iterate:
     variance: moments.Variance | None
 
     def variance_value(self) -> float:
-        """Return w ∫ tr Σ dt."""
+        """Return w ∫ tr Σ dt, but for what the start's covariance adds: steps hold that."""
         return 0.0 if self.variance is None else self.variance.value
 
 
@@ -58,7 +58,8 @@ def variance_of(model: Model, lin: Linearization, weight: float) -> moments.Vari
         return None
     d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], lin.x[:-1]))
     Lambda = moments.adjoint_weights(lin.A, model.dt)
-    return moments.variance_penalty(weight, lin.sigma, d_sigma, Lambda, model.dt)
+    start = moments.start_share(lin.A, Lambda, model.start_covariance)
+    return moments.variance_penalty(weight, lin.sigma, d_sigma, Lambda, model.dt, start)
 
 
 @_quiet

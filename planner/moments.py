@@ -1,15 +1,18 @@
 """Mean and covariance of the linearised process (paper §6.2, SPEC §3.2).
 
-    Σ_{k+1} = A_k Σ_k A_kᵀ + dt σ_k σ_kᵀ,   Σ_0 = 0,   A_k = I + dt ∂b/∂x
+    Σ_{k+1} = A_k Σ_k A_kᵀ + dt (σ_k σ_kᵀ + Σ_d σ′_kd Σ_k σ′_kdᵀ),   A_k = I + dt ∂b/∂x
 
-which is exact for the discretised linear system and positive semidefinite by construction.
+from the Σ_0 of the problem's start, zero where it is known: exact for the discretised linear
+system, and positive semidefinite by construction. σ′_d is the derivative of column d of σ; its
+term vanishes where σ depends on certain states alone, the paper's class (§6.1).
 
 The penalty w ∫ tr Σ dt = w Σ_{k=1}^{N−1} dt tr Σ_k needs no Σ in the sub-problem. With the
 adjoint weights
 
     Λ_{N−1} = dt I,   Λ_k = dt I + A_kᵀ Λ_{k+1} A_k     (dt of the interval that ends there)
 
-it equals w Σ_k dt tr(Λ_{k+1} σ_k σ_kᵀ). With σ linearised, σ_k + σ_k′ d, as the linear SDE of
+it equals w Σ_k dt tr(Λ_{k+1} σ_k σ_kᵀ) + w tr(A_0ᵀ Λ_1 A_0 Σ_0), in the paper's class; the
+second part is the same at every deviation. With σ linearised, σ_k + σ_k′ d, as the linear SDE of
 LOCP has it, this is a convex quadratic in the deviation d of each node: one backward sweep,
 no variable added, and nothing approximated. (The paper replaces σσᵀ by C(z_k)C(z)ᵀ to keep Σ
 affine; the value and the gradient at the iterate are those of the quadratic up to a factor 2
@@ -20,8 +23,13 @@ model oscillates.)
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from slipcar.planner.convexify import Linearization
+    from slipcar.planner.problem import Model
 
 Array = np.ndarray
 
@@ -31,33 +39,62 @@ class Variance:
     """w ∫ tr Σ dt of the linear SDE: value + gradient·d + ½ d·hessian·d, node by node.
 
     Attributes:
-        value: the integral times w at the iterate.
+        value: what the noise adds to it at the iterate; all of it where the start is known.
         gradient: with respect to the states at nodes 0..K−1, (K, n).
         hessian: positive semidefinite, (K, n, n).
+        start: what the start's covariance adds to it, held in steps as A is.
     """
 
     value: float
     gradient: Array
     hessian: Array
+    start: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """All of w ∫ tr Σ dt."""
+        return self.value + self.start
 
 
-def covariance(A: Array, sigma: Array, dt: Array) -> Array:
+def covariance(
+    A: Array,
+    sigma: Array,
+    dt: Array,
+    *,
+    start: Array | None = None,
+    d_sigma: Array | None = None,
+) -> Array:
     """Σ at every node.
 
     Args:
-        A: discrete state matrices, (K, n, n).
+        A: discrete state matrices, (K, n, n); those of the closed loop under feedback.
         sigma: diffusion at nodes 0..K−1, (K, n, d).
         dt: interval lengths, (K,) [s].
+        start: Σ_0, (n, n); None is zero.
+        d_sigma: ∂σ/∂x, (K, n, d, n), where σ may depend on uncertain states; None is zero.
 
     Returns:
-        (K + 1, n, n); the first is zero (the start is known).
+        (K + 1, n, n); the first is Σ_0.
     """
     K, n = A.shape[:2]
-    noise = dt[:, None, None] * (sigma @ sigma.swapaxes(1, 2))
+    noise = sigma @ sigma.swapaxes(1, 2)
+    by_column = None if d_sigma is None else d_sigma.swapaxes(1, 2)  # (K, d, n, n)
     S = np.zeros((K + 1, n, n))
+    if start is not None:
+        S[0] = start
     for k in range(K):
-        S[k + 1] = A[k].dot(S[k]).dot(A[k].T) + noise[k]
+        if by_column is not None:
+            noise[k] += (by_column[k] @ S[k] @ by_column[k].swapaxes(1, 2)).sum(axis=0)
+        S[k + 1] = A[k].dot(S[k]).dot(A[k].T) + dt[k] * noise[k]
     return S
+
+
+def covariance_of(model: Model, lin: Linearization) -> Array:
+    """Σ at every node along a linearisation, in open loop: (N, n, n)."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of plans that failed
+        d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], lin.x[:-1]))
+        start = model.start_covariance
+        return covariance(lin.A, lin.sigma, model.dt, start=start, d_sigma=d_sigma)
 
 
 def trace_integral(S: Array, dt: Array) -> float:
@@ -76,8 +113,13 @@ def adjoint_weights(A: Array, dt: Array) -> Array:
     return L
 
 
+def start_share(A: Array, Lambda: Array, start: Array) -> float:
+    """What the start's covariance (n, n) adds to ∫ tr Σ dt; A and Λ along the path, (K, n, n)."""
+    return float(np.vdot(A[0].T @ Lambda[0] @ A[0], start)) if start.any() else 0.0
+
+
 def variance_penalty(
-    weight: float, sigma: Array, d_sigma: Array, Lambda: Array, dt: Array
+    weight: float, sigma: Array, d_sigma: Array, Lambda: Array, dt: Array, start: float = 0.0
 ) -> Variance:
     """Return w ∫ tr Σ dt as a convex quadratic in the deviations, A held (it belongs to LOCP).
 
@@ -87,6 +129,7 @@ def variance_penalty(
         d_sigma: ∂σ/∂x, (K, n, d, n).
         Lambda: from :func:`adjoint_weights`, (K, n, n).
         dt: (K,).
+        start: from :func:`start_share`.
     """
     K, n, d = sigma.shape
     weighted = (weight * dt)[:, None, None] * Lambda  # (K, n, n)
@@ -98,15 +141,16 @@ def variance_penalty(
         value=float(np.vdot(against, sigma)),
         gradient=2.0 * np.matmul(against.reshape(K, 1, n * d), tall)[:, 0],
         hessian=2.0 * np.matmul(tall.swapaxes(1, 2), curved),
+        start=weight * start,
     )
 
 
 def trust_region_weight(hessian: Array, dt: Array) -> Array:
     """Hessian of ∫ E‖x − x_k‖² dt = ∫ ‖μᵉ‖² + tr Σᵉ dt at nodes 1..K, (K, n, n).
 
-    Both paths see the same Brownian motion, so to first order the error's diffusion is
-    σ′ (x − x_k): ∫ tr Σᵉ is the quadratic part of the variance penalty with weight one
-    (SPEC §3.4).
+    Both paths begin alike and see the same Brownian motion, so to first order the error's
+    diffusion is σ′ (x − x_k): ∫ tr Σᵉ is the quadratic part of the variance penalty with weight
+    one (SPEC §3.4).
 
     Args:
         hessian: of the variance penalty with weight one at nodes 0..K−1, (K, n, n).

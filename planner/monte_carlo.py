@@ -2,9 +2,10 @@
 
     x_{k+1} = x_k + dt_k b(t_k, x_k, u_k) + √dt_k σ(t_k, x_k) ξ_k,    u_k = control(t_k, x_k)
 
-Euler–Maruyama on the planner's own nodes. The noise is common to all controllers: path i of a
-seed meets the same ξ whoever drives and however many paths are asked for, so two rates differ by
-what the controllers do, and a search over plans sees a nearly monotone function.
+Euler–Maruyama on the planner's own nodes, from x_0 ~ N(start, Σ_0). Starts and noise are common
+to all controllers: path i of a seed meets the same x_0 and ξ whoever drives and however many paths
+are asked for, so two rates differ by what the controllers do, and a search over plans sees a
+nearly monotone function.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ Array = np.ndarray
 #: Paths stepped together: enough to hide Python's overhead, few enough to stay in the cache.
 #: Part of what a seed means: other blocks, other paths.
 BLOCK = 2048
+#: Which stream of a block starts are drawn from.
+_START = 1
 
 
 def violations(
@@ -33,6 +36,7 @@ def violations(
 ) -> Array:
     """Which paths break `problem.constraint` at a node 1..N−1.
 
+    Starts are drawn from N(start, start_covariance).
     A path whose state or constraint is no longer a finite number counts as one that does: nothing
     can be promised for it.
 
@@ -64,7 +68,7 @@ def violations(
     drive = control if project is None else lambda t, x: project(control(t, x))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         blocks = [
-            _violated(model, constraint, drive, _generator(seed, b))
+            _violated(model, constraint, drive, _generator(seed, b), _starts(model, seed, b))
             for b in range(-(-episodes // BLOCK))
         ]
     return np.concatenate(blocks)[:episodes]
@@ -76,14 +80,28 @@ def _generator(seed: int, block: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block,)))
 
 
+def _starts(model: Model, seed: int, block: int) -> Array:
+    """x(0) of each path of a block, (BLOCK, n)."""
+    x = np.tile(model.start, (BLOCK, 1))
+    if model.start_covariance.any():
+        # Of a stream of their own: the Brownian paths stay those of a known start.
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block, _START)))
+        values, vectors = np.linalg.eigh(model.start_covariance)
+        x += rng.standard_normal(x.shape) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return x
+
+
 def _violated(
     model: Model,
     constraint: Callable[[Array, Array], Array],
     control: Callable[[float, Array], Array],
     rng: np.random.Generator,
+    x: Array,
 ) -> Array:
-    """Which paths of one block, (BLOCK,). Always a whole block: results may round by its shape."""
-    x = np.tile(model.start, (BLOCK, 1))
+    """Which paths of one block, (BLOCK,), from states x (BLOCK, n).
+
+    Always a whole block: results may round by its shape.
+    """
     violated = np.zeros(BLOCK, dtype=bool)
     for k, dt in enumerate(model.dt):
         t = np.full(BLOCK, model.times[k])  # one for each path: all functions are batched alike

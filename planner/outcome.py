@@ -10,6 +10,7 @@ import numpy as np
 from slipcar.planner import moments
 from slipcar.planner.convexify import Linearization
 from slipcar.planner.history import Iteration
+from slipcar.planner.problem import Model
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -59,7 +60,7 @@ class Outcome:
     def at(
         cls,
         lin: Linearization,
-        dt: Array,
+        model: Model,
         variance_weight: float,
         *,
         status: Status,
@@ -70,8 +71,8 @@ class Outcome:
         message: str = "",
     ) -> Outcome:
         """What is known where an iteration ended, from its linearisation there."""
-        S = moments.covariance(lin.A, lin.sigma, dt)
-        variance = variance_weight * moments.trace_integral(S, dt)
+        S = moments.covariance_of(model, lin)
+        variance = variance_weight * moments.trace_integral(S, model.dt)
         return cls(
             status=status,
             x=lin.x,

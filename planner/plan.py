@@ -35,7 +35,7 @@ class Plan:
         times: nodes, (N,) [s].
         mean: μ, (N, n), in the units of the problem's state.
         controls: u, (N−1, m), constant on each interval.
-        covariance: Σ, (N, n, n).
+        covariance: Σ, (N, n, n); the first is the problem's `start_covariance`, zero by default.
         effort: Σ dt uᵀRu.
         obstacle_cost: Σ dt Σ w max(0, c(μ))².
         running_cost: Σ dt (H(μ) + ℓ(μ)ᵀu), the problem's smooth running costs.

@@ -70,7 +70,8 @@ def plan(
     Args:
         problem: anything that satisfies :class:`slipcar.planner.Problem`; a Scenario does.
         variance_weight: w ≥ 0; 0 is deterministic SCP. None is 1, or 0 with one of `risk`,
-            `risk_price`, `feedback` and `expected`, whose cost counts the noise already.
+            `risk_price`, `feedback` and `expected`, whose cost counts the noise already. Without
+            one of them, w > 0 asks for a diffusion that depends on no uncertain state.
         solver: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with their interface; see
             :mod:`slipcar.planner.backends`.
         method: `"newton"`: one LQ problem per iteration and Newton's method at the end, quadratic
@@ -141,7 +142,8 @@ def plan(
     Raises:
         TypeError: if `problem` lacks a required member.
         ValueError: for an option or a problem's function out of range, naming it; for a drift
-            that is not affine in the control, or a diffusion that depends on noisy states.
+            that is not affine in the control, or a diffusion that depends on uncertain states
+            where `variance_weight` is to charge the noise.
     """
     began = time.perf_counter()
     if shooting and compiled:
@@ -195,7 +197,7 @@ def plan(
     x, u = model.guess() if guess is None else given_guess(model, guess)
     if check_derivatives:  # before the rest, which relies on them
         checks.check_derivatives(model, x, u)
-    checks.check_once(model, x, u)
+    checks.check_once(model, x, u, charged=options.variance_weight > 0 and not request.wanted)
     record: dict[str, Any] = {
         **options.as_dict(),
         "starts": int(starts),

@@ -4,7 +4,8 @@
     s.t.      dx = b(t,x,u) dt + σ(t,x) dB,   x(0) = start,   E[g(x(T))] = 0,
               lower ≤ u ≤ upper,   ‖u‖₂ ≤ radius
 
-b is affine in u; σ may depend only on states that the noise never reaches (paper §6.1).
+b is affine in u; x(0) may be uncertain (`start_covariance`). Where `variance_weight` is to charge
+the noise, σ may depend only on states that stay certain (paper §6.1).
 Costs of the state are charged at nodes 1..N−1, each with the dt of the interval that ends there,
 those of the control with the dt of its interval; both are taken at the mean, and the noise is
 charged by `variance_weight` in :func:`slipcar.planner.plan`.
@@ -52,6 +53,8 @@ class Problem(Protocol):
       for g(μ) = 0.
     * `initial_guess()` -> states (N, n), controls (N−1, m); otherwise the uncontrolled path
       (or the start at all times, if that path grows without bound).
+    * `start_covariance` (n, n): of x(0), symmetric positive semidefinite, with the mean `start`;
+      zero otherwise.
     * `angles`: state components of period 2π, so that feedback wraps their errors.
     * `decode_observation(obs)` -> (t, x) and `encode_control(u)` -> action, for controllers
       that act in an environment.
@@ -89,6 +92,7 @@ class Model:
     Attributes:
         problem: the object it was made from.
         start: (n,).
+        start_covariance: (n, n), zero where the start is known.
         times: (N,) [s].
         dt: (N−1,) interval lengths [s].
         R: control weight, (m, m).
@@ -114,6 +118,7 @@ class Model:
 
     problem: Problem
     start: Array
+    start_covariance: Array
     times: Array
     dt: Array
     R: Array
@@ -229,6 +234,7 @@ def _checked(problem: Problem) -> Model:
             f"{type(problem).__name__} is not a slipcar.planner.Problem: it lacks {missing}"
         )
     start = _finite("start", problem.start, (None,))
+    start_covariance = _start_covariance(problem, len(start))
     times = _finite("times", problem.times, (None,))
     if len(times) < 2 or not (np.diff(times) > 0).all():
         raise ValueError(f"times must be at least 2 increasing nodes, not {times!r}")
@@ -275,6 +281,7 @@ def _checked(problem: Problem) -> Model:
     return Model(
         problem=problem,
         start=start,
+        start_covariance=start_covariance,
         times=times,
         dt=np.diff(times),
         R=R,
@@ -292,6 +299,29 @@ def _checked(problem: Problem) -> Model:
         terminal_jacobian=terminal_jacobian,
         **_running_costs(problem, t2, x2, m),
     )
+
+
+def _start_covariance(problem: Problem, n: int) -> Array:
+    """Σ_0, checked, (n, n); zero where the problem has none."""
+    given = getattr(problem, "start_covariance", None)
+    if given is None:
+        return np.zeros((n, n))
+    S = _finite("start_covariance", given, (n, n))
+    largest = float(np.abs(S).max(initial=0.0))
+    bent = np.argwhere(np.abs(S - S.T) > 1e-9 * largest)
+    if len(bent):
+        i, j = (int(index) for index in bent[0])
+        raise ValueError(
+            f"start_covariance must be symmetric, but [{i}, {j}] is {S[i, j]:.6g} and "
+            f"[{j}, {i}] is {S[j, i]:.6g}"
+        )
+    S = 0.5 * (S + S.T)
+    least = float(np.linalg.eigvalsh(S)[0])
+    if least < -1e-9 * largest:
+        raise ValueError(
+            f"start_covariance must be positive semidefinite, but has the eigenvalue {least:.3g}"
+        )
+    return S
 
 
 def _running_costs(problem: Problem, t2: Array, x2: Array, m: int) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from slipcar.planner.codegen.traced import parameter_row
 from slipcar.planner.controllers import OpenLoop
-from slipcar.planner.feedback import wrap
+from slipcar.planner.feedback import closed_loop_covariance, wrap
 from slipcar.planner.horizon_batch import Tails
 from slipcar.planner.horizon_setup import as_plan, handover_of, replanner, stakes_of
 from slipcar.planner.options import check_count, check_number
@@ -208,6 +208,29 @@ class RecedingHorizon(OpenLoop):
         u = u.reshape(*shape, u.shape[1])
         action = np.asarray(u if encode is None else encode(u), dtype=np.float32)
         return action, Underway(tuple(groups), failures)
+
+    def preview(self, state: Underway | None = None, row: int = 0) -> tuple[Array, Array | None]:
+        """An episode's latest plan, from the state it was made from.
+
+        Args:
+            state: what `predict` returned; None is before the start.
+            row: which episode of those `predict` was asked for.
+
+        Returns:
+            Mean states (K + 1, n) and closed-loop covariances (K + 1, n, n).
+
+        Raises:
+            ValueError: if the state is of fewer episodes.
+        """
+        if state is None:
+            return self.plan.mean, self.plan.covariance
+        for group in state.groups:
+            for place in np.flatnonzero(group.rows == row):
+                x, A, B, gains = (getattr(group.plans, f)[place] for f in ("x", "A", "B", "gains"))
+                model, times = self._replanner.model, self.plan.times[group.interval :]
+                known = np.zeros((x.shape[1], x.shape[1]))
+                return x, closed_loop_covariance(model, times, x, A, B, gains, start=known)
+        raise ValueError(f"row must be one of the state's {len(state.failures)}, not {row}")
 
     def _sources(self, state: Any, episode_start: Any, interval: Array) -> Array:
         """Which group of the state each episode goes on from, (E,); −1 where it begins anew."""

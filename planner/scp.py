@@ -108,7 +108,7 @@ def _attempt(
             at = iterate_at(model, options.variance_weight, at.lin.x, inside)
         return Outcome.at(
             at.lin,
-            model.dt,
+            model,
             options.variance_weight,
             status=status,
             adjoint=adjoint,
@@ -170,7 +170,7 @@ def _attempt(
                 running=new.lin.running,
                 variance=np.nan
                 if new.variance is None
-                else new.variance_value() / options.variance_weight,
+                else new.variance.total / options.variance_weight,
                 merit=after,
                 predicted=predicted,
                 actual=actual,

@@ -234,7 +234,7 @@ def improved(plan: Plan, shot: Shot) -> Plan:
     if not shot.converged:
         raise ValueError(f"this shot did not converge ({shot.message}): it improves nothing")
     at, dt = shot.at, np.diff(plan.times)
-    S = moments.covariance(at.A, at.sigma, dt)
+    S = moments.covariance_of(model_for(plan), at)
     return plan.replace(
         status=Status.CONVERGED,
         mean=at.x,

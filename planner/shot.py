@@ -56,7 +56,7 @@ def solve_shooting(
     if last is None or not last.converged:
         return found, last
     hit = Outcome.at(
-        last.at, model.dt, options.variance_weight, status=Status.CONVERGED,
+        last.at, model, options.variance_weight, status=Status.CONVERGED,
         adjoint=last.adjoint, terminal=last.terminal, history=found.history,
     )  # fmt: skip
     return hit, last

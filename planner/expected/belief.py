@@ -9,8 +9,10 @@ With rows' derivatives by variance η and J the quadratic in deviations that fol
 
 (column d of σ linearised, σ_d + σ′_d δx: under feedback the states it depends on are noisy too)
 the expected cost is that of the mean plus Σ_k dt tr(P_{k+1} σ_k σ_kᵀ), and P is its derivative by
-the noise that arrives at a node. Rows are Gaussian with the expectation c(μ) + ½ tr(∂²c Σ) and
-the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more distance than its mean does.
+the noise that arrives at a node. (The Σ_0 of an uncertain start adds tr(P_0 Σ_0), with P_0 by the
+same recursion and D_0 = 0: no part of a step, in which A, B and K are held.) Rows are Gaussian with
+the expectation c(μ) + ½ tr(∂²c Σ) and the deviation s = (C Σ Cᵀ)^½: a path past a disc keeps more
+distance than its mean does.
 
 Held while a step is computed, P makes the noise a cost of the deterministic states σ depends on:
 the sensitivity of every later Σ is in it. That η and K would follow is of second order at a
@@ -130,15 +132,9 @@ def _expectations(bend: Array, S: Array) -> Array:
 
 
 def _covariance(model: Model, at: Iterate, gains: Array) -> Array:
-    lin, dt = at.lin, model.dt
-    closed = lin.A + lin.B @ gains
-    noise = lin.sigma @ lin.sigma.swapaxes(1, 2)
-    by_column = at.d_sigma.swapaxes(1, 2)  # (K, d, n, n)
-    S = np.zeros((len(dt) + 1, *lin.A.shape[1:]))
-    for k in range(len(dt)):
-        spread = (by_column[k] @ S[k] @ by_column[k].swapaxes(1, 2)).sum(axis=0)
-        S[k + 1] = closed[k] @ S[k] @ closed[k].T + dt[k] * (noise[k] + spread)
-    return S
+    lin = at.lin
+    closed, start = lin.A + lin.B @ gains, model.start_covariance
+    return moments.covariance(closed, lin.sigma, model.dt, start=start, d_sigma=at.d_sigma)
 
 
 def _weights(model: Model, at: Iterate, stakes: Stakes, held: Array) -> tuple[Array, Array]:

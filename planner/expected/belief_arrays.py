@@ -14,10 +14,9 @@ from slipcar.planner.expected.arrays import row_loss, row_weight
 from slipcar.planner.expected.losses import FLOOR
 from slipcar.planner.newton.iterate_arrays import (
     congruence,
+    covariance,
     noise_cost_at,
-    noise_of,
     semidefinite,
-    spread,
 )
 from slipcar.planner.newton.native import call
 
@@ -73,28 +72,6 @@ def deviations(C, Sigma, s):
 
 
 @numba.njit(error_model="numpy")
-def covariance(closed, sigma, d_sigma, dt, Sigma):
-    """`belief._covariance`."""
-    K, n, d = sigma.shape
-    scratch, noise = np.empty((n, n)), np.empty((n, n))
-    Sigma[0] = 0.0
-    for k in range(K):
-        noise_of(sigma[k], noise)
-        # Σ of the states that σ depends on adds to the noise: σ′ Σ σ′ᵀ.
-        for a in range(d):
-            for i in range(n):
-                for y in range(n):
-                    b = d_sigma[k, i, a, y]
-                    if b != 0.0:
-                        for z in range(n):
-                            c = b * Sigma[k, y, z]
-                            if c != 0.0:
-                                for j in range(n):
-                                    noise[i, j] += c * d_sigma[k, j, a, z]
-        spread(closed[k], Sigma[k], dt[k], noise, scratch, Sigma[k + 1])
-
-
-@numba.njit(error_model="numpy")
 def close_loop(A, B, gains, closed):
     """A + BK."""
     K, n, m = B.shape
@@ -147,7 +124,7 @@ def propagate(
     fresh, lower, upper, gains, held, closed, Sigma, bend, offset, s, P, vg, vh, low_bound,
     high_bound,
 ):  # fmt: skip
-    """`belief.propagate`; writes from `gains` on. `fresh`: there are no weights to start from."""
+    """`belief.propagate`; writes from `gains` on, but for Σ_0. `fresh`: without weights as yet."""
     A, B, sigma, d_sigma, C, c, Hxx, G = at[1], at[2], at[3], at[4], at[8], at[7], at[11], at[13]
     K, n, m = B.shape
     p = C.shape[1]

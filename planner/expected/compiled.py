@@ -263,6 +263,7 @@ def _sources() -> Any:
 
 #: Iterate on problems of one kind and one grid size; the first axis of every array counts them.
 #: In place: x (P, N, n), u (P, K, m) and, where `warm`, gains (P, K, m, n), the rows' weights held
-#: (P, K, p) and multipliers (P, K, n), (P, q). Writes A, B, Σ (P, N, n, n), rows c and their
-#: deviations s (P, K, p), (effort, running cost, objective) and (how it ended, steps tried).
+#: (P, K, p) and multipliers (P, K, n), (P, q). Writes A, B, Σ (P, N, n, n) from the first on, which
+#: is given, rows c and their deviations s (P, K, p), (effort, running cost, objective) and (how it
+#: ended, steps tried).
 solve_many = _compiled(stamp(_sources()))

@@ -51,7 +51,8 @@ class Steered:
         effort: Σ dt uᵀRu.
         running: Σ dt (H + ℓᵀu).
         objective: the cost of the last step, P held: the mean's, plus what the noise is charged;
-            rows' spread is in both. `field.value` is the expected cost.
+            rows' spread is in both, and that of the start in neither. `field.value` is the
+            expected cost.
         iterations: steps tried.
     """
 

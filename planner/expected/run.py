@@ -40,7 +40,7 @@ class Batch:
         terminal: (P, q).
         A: (P, K, n, n).
         B: (P, K, n, m).
-        covariance: (P, N, n, n).
+        covariance: (P, N, n, n); the first of each is that of its start, zero in new problems.
         c: expectations, (P, K, p).
         s: (P, K, p).
         values: effort, running cost, objective, (P, 3).
@@ -74,7 +74,7 @@ class Batch:
             terminal=np.zeros((P, q)),
             A=np.empty((P, K, n, n)),
             B=np.empty((P, K, n, m)),
-            covariance=np.empty((P, N, n, n)),
+            covariance=np.zeros((P, N, n, n)),
             c=np.empty((P, K, p)),
             s=np.empty((P, K, p)),
             values=np.empty((P, 3)),
@@ -185,6 +185,7 @@ def iterate(
     assert functions.kernels is not None
     q = functions.kernels.terminal.outputs["g"]
     batch = Batch.of(x[None], u[None], len(stakes.weight), q)
+    batch.covariance[0, 0] = model.start_covariance
     if warm is not None:
         batch.gains[0], batch.held[0] = warm.gains, warm.held
         batch.adjoint[0], batch.terminal[0] = warm.adjoint, warm.terminal

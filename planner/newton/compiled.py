@@ -23,6 +23,7 @@ from slipcar.planner.newton.iterate_arrays import (
     evaluate,
     inconsistency,
     lagrangian,
+    start_share,
     storage,
 )
 from slipcar.planner.newton.model_arrays import (
@@ -229,6 +230,8 @@ def _iterate(
         step, radius = alpha * alpha * step, alpha * alpha * radius
         row = table[tried]
         row[0], row[1], row[2], row[3] = new[19][0], new[19][1], new[19][2], new[19][3]
+        if w > 0.0:
+            row[3] += w * start_share(new[1][0], new[20][0], S_out[0])
         row[4], row[5], row[6], row[7], row[8] = merit, predicted, actual, step, radius
         row[9], row[10], row[11] = shift if curved else 0.0, new[19][4], new[19][5]
         row[12], row[13], row[14], row[15] = 1.0 if accepted else 0.0, solves, linearized, solved
@@ -269,7 +272,9 @@ def _iterate(
         last = step
     x_out[:], u_out[:], adjoint_out[:], nu_out[:] = at[14], at[15], last_adjoint, last_nu
     A_out[:], B_out[:], cost_out[:] = at[1], at[2], at[19][:4]
-    covariance(at[1], at[3], dt, S_out)
+    if w > 0.0:
+        cost_out[3] += w * start_share(at[1][0], at[20][0], S_out[0])
+    covariance(at[1], at[3], at[4], dt, S_out)
     return status, tried
 
 
@@ -295,7 +300,8 @@ def _compiled(version: int) -> Any:
 
 
 #: Solve problems of one kind and one grid size; the first axis of every array counts them. Writes
-#: trajectories (P, N, n) and (P, K, m), multipliers (P, K, n) and (P, q), A, B, Σ, the four costs
-#: (effort, penalty, running, w ∫ tr Σ dt), the table (P, max_iterations, columns), the
-#: trajectories of each step tried (P, steps to keep, ...), and (how it ended, steps tried).
+#: trajectories (P, N, n) and (P, K, m), multipliers (P, K, n) and (P, q), A, B, Σ (P, N, n, n) from
+#: the first on, which is given, the four costs (effort, penalty, running, w ∫ tr Σ dt), the table
+#: (P, max_iterations, columns), the trajectories of each step tried (P, steps to keep, ...), and
+#: (how it ended, steps tried).
 solve_many = _compiled(stamp(Path(__file__).with_name(f"{name}.py") for name in SOURCES))

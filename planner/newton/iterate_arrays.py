@@ -230,14 +230,36 @@ def inconsistency(at):
 
 
 @numba.njit(error_model="numpy")
-def covariance(A, sigma, dt, Sigma):
-    """`moments.covariance`."""
-    K, n, _ = sigma.shape
+def covariance(A, sigma, d_sigma, dt, Sigma):
+    """`moments.covariance`, from the Σ_0 that is there on."""
+    K, n, d = sigma.shape
     scratch, noise = np.empty((n, n)), np.empty((n, n))
-    Sigma[0] = 0.0
     for k in range(K):
         noise_of(sigma[k], noise)
+        # Σ of the states that σ depends on adds to the noise: σ′ Σ σ′ᵀ.
+        for a in range(d):
+            for i in range(n):
+                for y in range(n):
+                    b = d_sigma[k, i, a, y]
+                    if b != 0.0:
+                        for z in range(n):
+                            c = b * Sigma[k, y, z]
+                            if c != 0.0:
+                                for j in range(n):
+                                    noise[i, j] += c * d_sigma[k, j, a, z]
         spread(A[k], Sigma[k], dt[k], noise, scratch, Sigma[k + 1])
+
+
+@numba.njit(error_model="numpy")
+def start_share(A, Lambda, start):
+    """`moments.start_share`; A and Λ of the first interval."""
+    n = len(A)
+    LA, weight, value = np.empty((n, n)), np.zeros((n, n)), 0.0
+    congruence(A, Lambda, LA, weight)
+    for i in range(n):
+        for j in range(n):
+            value += weight[i, j] * start[i, j]
+    return value
 
 
 @numba.njit(error_model="numpy")

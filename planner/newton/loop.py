@@ -137,7 +137,7 @@ def iterate(
                 effort=new.lin.effort,
                 penalty=new.lin.penalty,
                 running=new.lin.running,
-                variance=np.nan if new.variance is None else new.variance.value / w,
+                variance=np.nan if new.variance is None else new.variance.total / w,
                 merit=search.merit,
                 predicted=search.predicted,
                 actual=search.actual,
@@ -181,7 +181,7 @@ def iterate(
             status = Status.STOPPED
             break
     return Outcome.at(
-        at.lin, model.dt, w, status=status, adjoint=adjoint, terminal=terminal,
+        at.lin, model, w, status=status, adjoint=adjoint, terminal=terminal,
         history=tuple(history),
     )  # fmt: skip
 

@@ -52,7 +52,7 @@ class Iterate:
 
     @property
     def cost(self) -> float:
-        """Effort, penalty, running cost and w ∫ tr Σ dt."""
+        """Effort, penalty, running cost and w ∫ tr Σ dt, what the start adds to it left out."""
         lin = self.lin
         variance = 0.0 if self.variance is None else self.variance.value
         return lin.effort + lin.penalty + lin.running + variance
@@ -106,7 +106,8 @@ def evaluate(model: Model, functions: Functions, w: float, x: Array, u: Array) -
     d_sigma = stage["d_sigma"].reshape(*sigma.shape, n)
     if w > 0.0:
         Lambda = moments.adjoint_weights(A, dt)
-        variance = moments.variance_penalty(w, sigma, d_sigma, Lambda, dt)
+        start = moments.start_share(A, Lambda, model.start_covariance)
+        variance = moments.variance_penalty(w, sigma, d_sigma, Lambda, dt, start)
         weights = w * dt[:, None, None] * Lambda
     return Iterate(lin, d_ell, H_xx, d_sigma, variance, weights)
 

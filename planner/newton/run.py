@@ -220,7 +220,7 @@ def run(
         terminal=np.empty((P, q)),
         A=np.empty((P, K, n, n)),
         B=np.empty((P, K, n, m)),
-        covariance=np.empty((P, N, n, n)),
+        covariance=np.zeros((P, N, n, n)),
         costs=np.empty((P, 4)),
         table=np.empty((P, max_iterations, len(compiled.COLUMNS))),
         steps=(np.empty((P, keep, N, n)), np.empty((P, keep, K, m)), np.empty((P, keep, q))),
@@ -231,6 +231,7 @@ def run(
         copied(parameters),
         *(stacked(name) for name in ("times", "R", "lower", "upper", "weight")),
     ]
+    answers.covariance[:, 0] = stacked("start_covariance")
     guesses = [copied(x), copied(u)]
     found = [
         answers.x, answers.u, answers.adjoint, answers.terminal, answers.A, answers.B,

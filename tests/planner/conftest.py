@@ -106,7 +106,7 @@ def _settle(problem, *, native=False, start=None, warm=None, tolerance=1e-14, li
     return ready, stakes, found
 
 
-def _mass(*, bounds=None, slip=0.4, walls=True, curved=True, additive=0.05, nodes=13):
+def _mass(*, bounds=None, slip=0.4, walls=True, curved=True, additive=0.05, nodes=13, spread=0.0):
     """A point mass (p, v) whose noise grows with its speed, between affine rows, unevenly timed."""
     shape = np.diag([0.2, 0.1, 0.4, 0.3]) + 0.05
     gaps = 0.1 * (1.0 + 0.3 * np.sin(3.0 * np.arange(nodes - 1)))
@@ -119,6 +119,7 @@ def _mass(*, bounds=None, slip=0.4, walls=True, curved=True, additive=0.05, node
 
     members = {
         "start": np.array([0.0, 0.0, 0.1, -0.1]),
+        "start_covariance": spread**2 * (np.eye(4) + 0.5),
         "times": np.concatenate([[0.0], np.cumsum(gaps)]),
         "control_weight": np.array([[1.0, 0.2], [0.2, 0.6]]),
         "drift": lambda t, x, u: np.concatenate([x[..., 2:], u], axis=-1),

@@ -352,12 +352,12 @@ def test_quadrotor_moments_are_those_of_the_continuous_flight():
 
 @pytest.mark.parametrize("w", [0.0, 10.0])
 def test_quadrotor_moments_are_those_of_many_flights(w):
-    problem, paths = on_a_grid(201), 20_000
+    problem, paths = on_a_grid(201), 10_000
     p = plan(problem, variance_weight=w, integrator="rk4")
     for k, x in zip((100, 200), simulate(problem, p, paths, 2), strict=True):
         sigma = np.sqrt(np.diag(p.covariance[k]))
         scale = np.outer(sigma, sigma) + 1e-12
-        assert np.max(np.abs(np.cov(x.T) - p.covariance[k]) / scale) < 0.05
+        assert np.max(np.abs(np.cov(x.T) - p.covariance[k]) / scale) < 0.06
         assert (np.abs(x.mean(axis=0) - p.mean[k]) < 4.0 * sigma / np.sqrt(paths) + 1e-3).all()
         assert x[:, 2].std() == pytest.approx(0.0, abs=1e-12)
 

@@ -205,6 +205,6 @@ def test_an_observation_without_state_is_refused(controller):
 @pytest.mark.parametrize("controller", [OpenLoop, Feedback])
 def test_an_observation_of_the_car_has_its_length(law, controller):
     play = controller(law)
-    for length in (0, 1, 3, 1000):
+    for length in (0, 1, 3, 1001):
         with pytest.raises(ValueError, match="observation"):
             play.predict(np.zeros(length))

@@ -35,6 +35,7 @@ class Shooting:
         A, B = model.drift_jacobian(t[:-1], x[:-1], u)
         sigma, slopes = model.diffusion(t[:-1], x[:-1]), self.slopes(t[:-1], x[:-1])
         S = np.zeros((len(t), n, n))
+        S[0] = getattr(model.problem, "start_covariance", 0.0)
         for k in range(len(dt)):
             F = np.eye(n) + dt[k] * (A[k] + B[k] @ gains[k])
             spread = np.einsum("iad,ij,jbd->ab", slopes[:, k], S[k], slopes[:, k])
@@ -105,10 +106,13 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_where_nothing_is_neglected_the_expected_cost_is_stationary(kind, settle, mass):
+@pytest.mark.parametrize(
+    ("kind", "spread"),
+    [*((kind, 0.0) for kind in KINDS), ("open priced", 0.15), ("feedback priced", 0.15)],
+)
+def test_where_nothing_is_neglected_the_expected_cost_is_stationary(kind, spread, settle, mass):
     """Affine dynamics and rows: zero slope in the controls and in the gains, to differences."""
-    ready, stakes, found = settle(mass(), tolerance=1e-18, **KINDS[kind])
+    ready, stakes, found = settle(mass(spread=spread), tolerance=1e-18, **KINDS[kind])
     assert found.status is Status.CONVERGED
     shooting = Shooting(ready, stakes)
     cost, g = shooting(found.u, found.gains)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, multivariate_normal, norm
 
+from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
 from slipcar.evaluation import statistics as evaluation_statistics
 from slipcar.evaluation.noise import block_noise
@@ -194,7 +195,7 @@ def test_evaluations_with_the_same_seed_meet_other_noise(seed):
     problem.drift = lambda t, x, u: 0.0 * x
     problem.diffusion = lambda t, x: np.broadcast_to(np.eye(3), (*x.shape, 3))
     for block in (0, 1):
-        theirs = next(block_noise(seed, block, 1))[:, 0] > 0.0
+        theirs = next(block_noise(seed, block, Scenario.named("paper")))[:, 0] > 0.0
         for i in range(3):
             problem.constraint = lambda t, x, i=i: x[..., i : i + 1]
             ours = violations(problem, still, episodes=4_096, seed=seed).reshape(4, -1)

@@ -128,9 +128,9 @@ def test_headings_beyond_pi_are_the_same_headings():
     [
         (lambda o: np.where(np.arange(6) == 2, np.nan, o), r"observation\[2\] is nan"),
         (lambda o: np.where(np.arange(6) == 0, np.inf, o), r"observation\[0\] is inf"),
-        (lambda o: o[:5], "shape"),
-        (lambda o: np.zeros(11), "shape"),
-        (lambda o: 1.0, "shape"),
+        (lambda o: o[:5], "last axis"),
+        (lambda o: np.zeros(11), "last axis"),
+        (lambda o: 1.0, "last axis"),
         (lambda o: np.stack([o, o * np.nan]), r"observation\[1, 0\] is nan"),
     ],
 )

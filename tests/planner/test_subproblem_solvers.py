@@ -220,7 +220,7 @@ def test_an_uncontrollable_linearisation_is_solved_and_says_what_is_missing():
 @pytest.mark.parametrize("solver", ["structured", "osqp", "cvxpy"])
 def test_a_goal_out_of_reach_is_called_infeasible_by_every_backend(solver):
     # |a_v| <= 0.1 for 5 s covers 0.625 m from rest to rest; the goal is 3.72 m away.
-    p = plan(PAPER.replace(control_bounds=(0.1, 0.1)), solver=solver)
+    p = plan(PAPER.replace(control_bounds=(0.1, 0.1), nodes=11), solver=solver)
     assert p.status is Status.INFEASIBLE
     assert p.history[-1].virtual_control > 2.0
     assert np.all(np.abs(p.controls) <= 0.1 + 1e-9)

@@ -51,7 +51,7 @@ def test_steps_of_a_plan_keep_the_papers_radius(monkeypatch, radius, rollout):
     paper = Scenario.named("paper")
     u = np.full((40, 2), 0.1)
     guess = (rollout(paper, u), u)  # a path it can drive: staying there is a step of length zero
-    p = plan(paper, guess=guess, trust_region="paper", max_iterations=20, cold_start="never")
+    p = plan(paper, guess=guess, trust_region="paper", max_iterations=8, cold_start="never")
     allowed = radius * 0.99 ** np.arange(len(p.history))
     taken = np.array([h.trust_radius for h in p.history])
     # Whatever a step leaves as defect, the next must take up: a little more than Δ at times.
@@ -67,7 +67,7 @@ def test_the_shortest_step_is_taken_where_none_fits(monkeypatch):
     monkeypatch.setitem(trust_region.TRUST_REGIONS, "paper", lambda: PaperTrustRegion(radius=1e-9))
     shortest = plan(paper, trust_region="paper", max_iterations=1).history[0]
     assert 1e-9 < shortest.trust_radius < free
-    again = plan(paper, trust_region="paper", max_iterations=20)
+    again = plan(paper, trust_region="paper", max_iterations=8)
     assert np.isfinite(again.mean).all()
     assert again.history[-1].defect < 0.2
 

@@ -1,5 +1,7 @@
 """Guesses: earlier plans, other grids, bad ones; what is returned when they lead nowhere."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -112,28 +114,38 @@ def bad_guesses():
 CONVEX = {"method": "convex"}
 
 
-@pytest.mark.parametrize("options", [{}, CONVEX], ids=["as it comes", "convex"])
+@functools.cache
+def by_itself(method):
+    """The plan from the problem's own guess."""
+    return plan(PAPER, method=method)
+
+
+@functools.cache
+def left_alone(name, method):
+    """The plan from a bad guess, compared with nothing."""
+    return plan(PAPER, guess=dict(bad_guesses())[name], cold_start="never", method=method)
+
+
+@pytest.mark.parametrize("method", ["auto", "convex"])
 @pytest.mark.parametrize("name", [name for name, _ in bad_guesses()])
-def test_no_bad_guess_makes_a_plan_worse(name, options):
-    guess = dict(bad_guesses())[name]
-    cold = plan(PAPER, **options)
-    p = plan(PAPER, guess=guess, **options)
+def test_no_bad_guess_makes_a_plan_worse(name, method):
+    p = plan(PAPER, guess=dict(bad_guesses())[name], method=method)
     assert p.status is Status.CONVERGED
-    assert objective(p) <= objective(cold) * (1.0 + 1e-5)
+    own = objective(by_itself(method))
+    assert objective(p) <= own * (1.0 + 1e-5)
     assert "guess" in p.message
-    alone = plan(PAPER, guess=guess, cold_start="never", **options)
-    if alone.status.ok and abs(objective(alone) - objective(cold)) > 1e-3:
-        better = objective(alone) < objective(cold)
+    alone = left_alone(name, method)
+    if alone.status.ok and abs(objective(alone) - own) > 1e-3:
+        better = objective(alone) < own
         source = "from the given guess" if better else "from the problem's own guess"
         assert source in p.message
 
 
 def test_bad_guesses_do_lead_elsewhere_when_left_alone():
     # Otherwise the test above would show nothing.
-    cold = plan(PAPER, **CONVEX)
     worse = [
-        not p.status.ok or objective(p) > 1.01 * objective(cold)
-        for p in (plan(PAPER, guess=g, cold_start="never", **CONVEX) for _, g in bad_guesses())
+        not p.status.ok or objective(p) > 1.01 * objective(by_itself("convex"))
+        for p in (left_alone(name, "convex") for name, _ in bad_guesses())
     ]
     assert sum(worse) >= 2
 
@@ -142,13 +154,12 @@ def test_a_converged_plan_on_the_wrong_side_stays_there_unless_compared():
     x, u = PAPER.initial_guess()
     x[:, :2] += np.outer(np.sin(np.linspace(0, np.pi, 41)), [-3.0, 2.0])
     wrong = plan(PAPER, guess=(x, u), cold_start="never", **CONVEX)
-    cold = plan(PAPER, **CONVEX)
     assert wrong.status is Status.CONVERGED
-    assert objective(wrong) > 1.1 * objective(cold)
+    assert objective(wrong) > 1.1 * objective(by_itself("convex"))
     stays = plan(PAPER, guess=wrong, **CONVEX)
     assert objective(stays) == pytest.approx(objective(wrong), rel=1e-3)
     compared = plan(PAPER, guess=wrong, cold_start="always", **CONVEX)
-    assert objective(compared) == pytest.approx(objective(cold), rel=1e-3)
+    assert objective(compared) == pytest.approx(objective(by_itself("convex")), rel=1e-3)
     assert "the problem's own guess: the given one led to CONVERGED at" in compared.message
 
 
