@@ -30,7 +30,20 @@ OwnScenarioOption = Annotated[
     ),
 ]
 
-CONTROLLERS = ("scp", "feedback", "deterministic", "straight", "ppo")
+#: Words for controllers, and what each is.
+CONTROLLERS = {
+    "scp": "stochastic SCP, open loop",
+    "feedback": "stochastic SCP, tracked by an LQR",
+    "planned-feedback": "a plan with the feedback that it was planned with",
+    "receding": "receding horizon, replanned at every step",
+    "deterministic": "deterministic SCP, open loop",
+    "straight": "straight line, ignores obstacles",
+    "ppo": "PPO, the shipped policy",
+}
+CONTROLLER_HELP = (
+    f"who drives: {', '.join(CONTROLLERS)}; or a plan's .npz file (with its feedback gains if it "
+    "has some), or a policy's .safetensors file or folder"
+)
 
 
 def read_scenario(text: str) -> Scenario:
@@ -69,10 +82,12 @@ def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, S
         OSError: if the file cannot be read.
     """
     from slipcar import baselines
-    from slipcar.planner import Feedback, OpenLoop, Plan, plan
+    from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
 
     path = Path(text)
-    if text == "ppo" or path.suffix in (".safetensors", ".json") or path.is_dir():
+    # A word is the controller, also where a folder happens to have its name.
+    stored_policy = path.suffix in (".safetensors", ".json") or path.is_dir()
+    if text == "ppo" or (text not in CONTROLLERS and stored_policy):
         policy = baselines.load_policy(None if text == "ppo" else path)
         return policy, scenario or policy.scenario
     if path.suffix == ".npz":
@@ -87,6 +102,10 @@ def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, S
         return OpenLoop(plan(world)), world
     if text == "feedback":
         return Feedback(plan(world)), world
+    if text == "planned-feedback":
+        return Feedback(plan(world, feedback=True)), world
+    if text == "receding":
+        return RecedingHorizon(world), world
     if text == "deterministic":
         return OpenLoop(baselines.deterministic_scp(world)), world
     if text == "straight":

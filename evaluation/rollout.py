@@ -21,11 +21,12 @@ import numpy as np
 import threadpoolctl
 
 from slipcar.envs import observation as layouts
+from slipcar.envs.options import check_slots
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.validate import checked_int
 from slipcar.evaluation.metrics import EpisodeMetrics
-from slipcar.evaluation.noise import BLOCK, block_noise
+from slipcar.evaluation.noise import BLOCK, block_noise, block_starts
 
 
 @runtime_checkable
@@ -33,7 +34,8 @@ class Controller(Protocol):
     """What is evaluated: an object with the `predict` of Stable-Baselines3.
 
     Optional attributes:
-        observation: `"features"` (default) or `"state"`, the kind `predict` is given.
+        observation: `"features"` (default), `"state"` or `"egocentric"`: what `predict` is given.
+        obstacle_slots: how many obstacles it is shown besides (default 0).
         closed_loop: whether it looks at the state (default True).
         preparation_time: seconds of planning or training (default unknown).
         failures: solves behind it that failed (default 0).
@@ -63,6 +65,7 @@ class Step:
 
     Attributes:
         index: k.
+        before: where it began, x_k, (rows, 5).
         control: u_k, (rows, 2) [m/s², rad/s²].
         moved: where it led; `moved.state` is x_{k+1}, (rows, 5).
         seconds: spent inside `predict`.
@@ -71,6 +74,7 @@ class Step:
     """
 
     index: int
+    before: np.ndarray
     control: np.ndarray
     moved: Transition
     seconds: float
@@ -180,12 +184,13 @@ def sample_paths(
     check_controller(controller)
     states = np.empty((episodes, scenario.nodes, 5))
     controls = np.empty((episodes, scenario.nodes - 1, 2))
-    states[:, 0] = scenario.start
-    with _one_thread():
+    with one_thread():
         for first in range(0, episodes, BLOCK):
             here = slice(first, min(first + BLOCK, episodes))
             wanted = here.stop - here.start
             for step in play(controller, scenario, seed, first // BLOCK, wanted):
+                if step.index == 0:
+                    states[here, 0] = step.before[:wanted]
                 states[here, step.index + 1] = step.moved.state[:wanted]
                 controls[here, step.index] = step.control[:wanted]
     return states, controls
@@ -214,11 +219,12 @@ def play(
     chunks = [slice(r, r + chunk) for r in range(0, rows, chunk)]
     hidden: list[Any] = [None] * len(chunks)
     starts = np.ones(chunk, dtype=bool)
-    kind = observation_kind(controller)
-    x = np.repeat(scenario.start[None], rows, axis=0)
-    noise = block_noise(seed, block, scenario.nodes - 1, substeps)
+    layout = observation_layout(controller)
+    check_slots(layout, scenario)
+    x = block_starts(seed, block, scenario)[:rows]
+    noise = block_noise(seed, block, scenario, substeps)
     for k, variates in enumerate(noise):
-        observed = layouts.observe(scenario, kind, scenario.times[k], x)
+        observed = layouts.observe(scenario, layout.kind, scenario.times[k], x, layout.slots)
         control = np.empty((rows, 2))
         seconds = 0.0
         for c, here in enumerate(chunks):
@@ -240,32 +246,30 @@ def play(
         moved = transition(scenario, x, control, variates[:rows])
         counted = [state.failures for state in hidden if hasattr(state, "failures")]
         failures = np.concatenate(counted) if len(counted) == len(chunks) else None
-        yield Step(k, control, moved, seconds, failures)
+        yield Step(k, x, control, moved, seconds, failures)
         x = moved.state
         starts = np.zeros(chunk, dtype=bool)
 
 
-def observation_kind(controller: Controller) -> str:
-    """Which kind `predict` is to be given: its `observation`, else what its space fits.
+def observation_layout(controller: Controller) -> layouts.Layout:
+    """What `predict` is to be given: its `observation` and `obstacle_slots`, else what fits.
 
     Raises:
-        ValueError: for an unknown kind.
+        ValueError: for an unknown kind, or a space that no observation fits.
     """
     named = getattr(controller, "observation", None)
     if isinstance(named, str):
-        return layouts.check_kind(named)
+        return layouts.Layout(named, getattr(controller, "obstacle_slots", 0))
     # A Stable-Baselines3 model says what it was trained on by its space alone.
     shape = getattr(getattr(controller, "observation_space", None), "shape", None)
-    for kind, entries in layouts.LAYOUTS.items():
-        if shape == (len(entries),):
-            return kind
-    if shape is not None:
-        sizes = {kind: len(entries) for kind, entries in layouts.LAYOUTS.items()}
+    if shape is None:
+        return layouts.Layout()
+    try:
+        return layouts.Layout.of_size(shape[0] if len(shape) == 1 else 0)
+    except ValueError as error:
         raise ValueError(
-            f"{controller_name(controller)} expects observations of shape {shape}; "
-            f"those known are {sizes}"
-        )
-    return "features"
+            f"{controller_name(controller)} expects observations of shape {shape}: {error}"
+        ) from None
 
 
 def controller_name(controller: Any) -> str:
@@ -280,7 +284,7 @@ def check_controller(controller: Any) -> None:
             f"a controller is an object with predict(observation, state, episode_start, "
             f"deterministic), which {controller!r} has not"
         )
-    observation_kind(controller)
+    observation_layout(controller)
     rows = checked_int("rows", getattr(controller, "rows", BLOCK), at_least=1, at_most=BLOCK)
     if BLOCK % rows:
         raise ValueError(f"{controller_name(controller)}.rows must divide {BLOCK}, not {rows}")
@@ -290,7 +294,7 @@ def _run(
     tasks: list[range], n_jobs: int, common: tuple
 ) -> Iterator[tuple[EpisodeMetrics, float, int | None]]:
     if n_jobs == 1 or len(tasks) == 1:
-        with _one_thread():
+        with one_thread():
             for task in tasks:
                 yield _measure(task, *common)
         return
@@ -358,7 +362,7 @@ def _checked_answer(
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """BLAS and torch on one thread, as in the workers.
 
     Threads split matrix products, and so the order of their sums, by how many there are; for
