@@ -1,8 +1,8 @@
 """The slipping car and its world: physics, costs, scenarios and Gymnasium environments.
 
     gym.make("slipcar.envs:SlipCar-v0", scenario="paper", observation="features")
-    gym.make_vec("slipcar.envs:SlipCar-v0", num_envs=1024,
-                 vectorization_mode="vector_entry_point")
+    gym.make_vec("slipcar.envs:SlipCar-v0", num_envs=1024, scenario="family:random",
+                 observation="egocentric", vectorization_mode="vector_entry_point")
 
 The module prefix in the id makes it work everywhere, in spawned workers too.
 """
@@ -10,18 +10,23 @@ The module prefix in the id makes it work everywhere, in spawned workers too.
 import gymnasium as gym
 
 from slipcar.envs.families import HELD_OUT_SEEDS, Family
+from slipcar.envs.overlay import Overlay
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import SlipCarEnv
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.vector import SlipCarVectorEnv
+from slipcar.envs.wrappers import SparseSuccess, VectorSparseSuccess
 
 __all__ = [
     "HELD_OUT_SEEDS",
     "Family",
+    "Overlay",
     "Scenario",
     "SlipCarEnv",
     "SlipCarVectorEnv",
+    "SparseSuccess",
     "Transition",
+    "VectorSparseSuccess",
     "control_from_action",
     "transition",
 ]

@@ -93,16 +93,25 @@ def functions_of(component: Any) -> Functions:
         return FLOATS
     if isinstance(component, np.ndarray):
         return ARRAYS
-    xp = array_namespace(component)
+    if array_api_compat.is_torch_array(component):
+        return tensor_functions()
+    raise TypeError(f"no floats, NumPy arrays or Torch tensors: {type(component).__name__}")
+
+
+@functools.cache
+def tensor_functions() -> Functions:
+    """For Torch tensors, one element per car: Torch's own, which have the fewest wrappers."""
+    import torch
+
     return Functions(
-        cos=xp.cos,
-        sin=xp.sin,
-        sqrt=xp.sqrt,
-        positive=lambda value: xp.clip(value, min=0.0),
-        clip=xp.clip,
-        bounded=lambda values, limit: [xp.clip(value, -limit, limit) for value in values],
-        total=lambda values: xp.sum(values, axis=0),
-        smallest=lambda values: xp.min(values, axis=0),
+        torch.cos,
+        torch.sin,
+        torch.sqrt,
+        torch.relu,
+        torch.clamp,
+        lambda values, limit: [torch.clamp(value, -limit, limit) for value in values],
+        functools.partial(torch.sum, dim=0),
+        functools.partial(torch.amin, dim=0),
     )
 
 

@@ -42,8 +42,8 @@ class Draw(NamedTuple):
         goal: (rows, 5).
         horizon: (rows,) [s].
         slip: (rows, 2), α² and β².
-        obstacles: (rows, k, 3); those beyond `count` are to be ignored.
-        count: (rows,), how many obstacles there are.
+        obstacles: (rows, k, 3); those beyond `counts` are to be ignored.
+        counts: (rows,), how many obstacles there are.
     """
 
     start: np.ndarray
@@ -51,7 +51,7 @@ class Draw(NamedTuple):
     horizon: np.ndarray
     slip: np.ndarray
     obstacles: np.ndarray
-    count: np.ndarray
+    counts: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Family:
             goal=drawn.goal[0],
             horizon=float(drawn.horizon[0]),
             slip=drawn.slip[0],
-            obstacles=drawn.obstacles[0, : drawn.count[0]],
+            obstacles=drawn.obstacles[0, : drawn.counts[0]],
         )
 
     def sample(self, seed: int) -> Scenario:

@@ -80,7 +80,7 @@ class Worlds:
         self.start = np.repeat(scenario.start[:, None], self._count, axis=1)
         self.start_deviation = scenario.start_deviation[:, None]
         self.tolerance = scenario.goal_tolerance[:, None]
-        self.action_scale = scenario.action_scale[:, None].astype(self._dtype)
+        self.action_scale: np.ndarray = scenario.action_scale[:, None].astype(self._dtype)
 
     def put(self, here: np.ndarray, source: Source, drawn: Draw | None) -> None:
         """Put the cars `here` (indices) into a scenario, or into worlds drawn from a family."""
@@ -107,7 +107,7 @@ class Worlds:
         self.action_scale[:, here] = base.action_scale[:, None]
         p.obstacle_weight[here] = base.obstacle_weight
         obstacles = base.obstacles[None] if drawn is None else drawn.obstacles
-        count = np.array([len(base.obstacles)]) if drawn is None else drawn.count
+        count = np.array([len(base.obstacles)]) if drawn is None else drawn.counts
         k = obstacles.shape[1]
         x, y, radius = np.moveaxis(obstacles, -1, 0)
         there = np.arange(k) < count[:, None]
@@ -161,7 +161,9 @@ class Worlds:
             self.shared = None
         p = self.parameters
         missing = max(0, obstacles - len(p.obstacles[0]))
-        absent = [np.full((missing, count), value, dtype=dtype) for value in _ABSENT]
+        absent: list[np.ndarray] = [
+            np.full((missing, count), value, dtype=dtype) for value in _ABSENT
+        ]
         known = dict(p.process)
         reached = {i: known.get(i, array(0.0)) for i in sorted(process | set(known))}
         self.parameters = p._replace(

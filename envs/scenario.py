@@ -204,7 +204,7 @@ class Scenario:
         """
         if not isinstance(name, str) or name not in worlds.NAMED:
             raise ValueError(f"unknown scenario {name!r}; the named ones are {cls.names()}")
-        return cls(**worlds.NAMED[name])
+        return cls(**worlds.named_world(name))
 
     @classmethod
     def random(

@@ -16,6 +16,7 @@ from slipcar.envs.cost import arrived
 from slipcar.envs.episode import draw_episode
 from slipcar.envs.fleet import base_of, longest_horizon, source_of
 from slipcar.envs.options import check_source, layout_for, read_options
+from slipcar.envs.overlay import Overlay
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.transition import control_from_action, goal_cost, proximity, step
@@ -75,6 +76,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Reset options
     * `scenario`: as the argument; stays until another is given.
+    * `start`: x(0) of this episode, (5,), in place of the scenario's.
     * `noise`: standard normal variates of this episode, (N − 1, substeps, 3 + p), with p the number
       of states that process noise reaches; in place of drawn ones.
 
@@ -110,7 +112,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         self.terminate_on_collision = bool(terminate_on_collision)
         self.render_mode = render_mode
         #: What is drawn over the scene beside the trail; see :class:`slipcar.envs.overlay.Overlay`.
-        self.overlay: Any = None
+        self.overlay: Overlay | None = None
         base = base_of(self.source)
         base.action_scale  # noqa: B018  raises now, not at the first step, if unbounded
         self.action_space = Box(-1.0, 1.0, (2,), np.float32)
@@ -148,13 +150,13 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Args:
             seed: None goes on with the generator.
-            options: `scenario` and `noise`; see the class.
+            options: `scenario`, `start` and `noise`; see the class.
 
         Raises:
             ValueError: for an unknown option or a bad value of one.
         """
         super().reset(seed=seed)
-        given, noise = read_options(options, ("scenario", "noise"))
+        given, start, noise = read_options(options, ("scenario", "start", "noise"))
         if given is not None:
             source = source_of(given)
             check_source(self.layout, self.observation_space, source)
@@ -168,7 +170,8 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
             shape = (scenario.nodes - 1, self.substeps, scenario.noise_dim)
             variates = checked_array("noise", noise, shape)
         self._noise = variates.tolist()
-        self._x: list[float] = episode.start.tolist()
+        x = episode.start if start is None else checked_array("start", start, (5,))
+        self._x: list[float] = x.tolist()
         self._step = 0
         self._over = False
         _, here, self._rims = proximity(self._p, self._x, FLOATS)
@@ -236,12 +239,14 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
             return None
         if self._scenario is None:
             raise ResetNeeded("call reset() before render()")
-        if self._screen is None or self._screen.scenario is not self._scenario:
+        if self._screen is None:
             from slipcar.envs.render import Screen
 
-            self.close()
             self._screen = Screen(self.scenario, human=self.render_mode == "human", fps=RENDER_FPS)
-        return self._screen.draw(np.array(self._trail), collided=self._distance < 0.0)
+        elif self._screen.scenario is not self._scenario:  # frames keep their size
+            self._screen.enter(self._scenario)
+        collided = self._distance < 0.0
+        return self._screen.draw(np.array(self._trail), collided=collided, overlay=self.overlay)
 
     def close(self) -> None:
         """Close the window, if any."""

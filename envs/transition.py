@@ -166,7 +166,7 @@ def checked_action(action: ArrayLike, batch: tuple[int, ...], dtype: type) -> np
         ValueError: for a wrong shape or a non-finite entry, naming its index.
     """
     try:
-        array = np.asarray(action, dtype=dtype)
+        array: np.ndarray = np.asarray(action, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise ValueError(f"action must be an array of numbers, not {action!r}") from error
     if array.shape != (*batch, car.CONTROL_DIM):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
@@ -14,9 +15,11 @@ from gymnasium.vector.utils import batch_space
 from slipcar.envs import observation as layouts
 from slipcar.envs.arrays import ARRAYS
 from slipcar.envs.cost import arrived
-from slipcar.envs.episode import halves, read_episodes, words_for_episode
+from slipcar.envs.episode import read_episodes, words_for_episode
 from slipcar.envs.fleet import Source, Worlds, base_of, longest_horizon, source_of
+from slipcar.envs.gallery import Gallery
 from slipcar.envs.noise import Tapes, seeds_of
+from slipcar.envs.noise_store import NoiseStore
 from slipcar.envs.options import check_source, layout_for, read_options
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import RENDER_FPS
@@ -107,9 +110,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._worlds = Worlds(self.num_envs, self._dtype, base)
         self._ready = False
         self._everyone = np.arange(self.num_envs)
-        #: Variates of the episodes, in halves (:func:`slipcar.envs.episode.halves`).
-        self._half = halves(base.nodes - 1)
-        self._noise = self._room_for_noise(self._half, self.substeps, base.noise_dim)
+        self._noise = NoiseStore(self.num_envs, base.nodes - 1, self.substeps, base.noise_dim)
         #: States, (5, num_envs), and the same as increments and observations take them.
         self._x = self._worlds.start.copy()
         self._rounded = self._x.astype(self._dtype)
@@ -119,7 +120,11 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._distance = np.full(self.num_envs, np.inf, dtype=self._dtype)
         self._over = np.ones(self.num_envs, dtype=bool)
         self._no_truncation = np.zeros(self.num_envs, dtype=bool)
-        self._film: Any = None
+        self._gallery: Gallery | None = None
+        if render_mode is not None:
+            human = render_mode == "human"
+            self._gallery = Gallery(self.num_envs, human=human, fps=RENDER_FPS)
+            self._shown: list[Scenario] = [base] * self._gallery.shown
 
     # ------------------------------------------------------------------------------- worlds
 
@@ -161,13 +166,15 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 seeds sub-environment i with `seed + i`, a list gives one seed each.
             options: `reset_mask`, a (num_envs,) bool array with at least one True; `scenario`,
                 as the argument of that name or a list of `num_envs` of them, for those that
-                are reset, until another is given; `noise`, standard normal variates
-                (num_envs, N − 1, substeps, 3 + p) of these episodes, in place of drawn ones.
+                are reset, until another is given; `start`, x(0) of these episodes
+                (num_envs, 5), and `noise`, their standard normal variates
+                (num_envs, N − 1, substeps, 3 + p), in place of drawn ones.
 
         Raises:
             ValueError: for an unknown option, a bad value of one, or a list of the wrong length.
         """
-        mask, given, noise = read_options(options, ("reset_mask", "scenario", "noise"))
+        known = ("reset_mask", "scenario", "start", "noise")
+        mask, given, start, noise = read_options(options, known)
         here = self._masked(mask)
         seeds = seeds_of(seed, self.num_envs)
         if given is not None:
@@ -177,13 +184,15 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 self._tapes.seed(int(i), own)
         self._ready = True
         self._start(here)
+        if start is not None:
+            starts = checked_array("start", start, (self.num_envs, 5))
+            self._put_at(here, starts[here].T)
         if noise is not None:
-            self._give_noise(here, noise)
+            self._noise.give(here, noise, int(self._worlds.steps.max()))
         _, distance, rims = self._proximity()
         started = np.zeros(self.num_envs, dtype=bool)
         started[here] = True
-        if self.render_mode is not None:
-            self._record(here)
+        self._record(here, moved=False)
         return self._observe(rims), self._info_at_start(distance, started)
 
     def _masked(self, mask: Any) -> np.ndarray:
@@ -235,55 +244,25 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _start_from(self, source: Source, here: np.ndarray) -> None:
         base, worlds = base_of(source), self._worlds
         words = self._tapes.take(here, words_for_episode(source, self.substeps))
-        alike = len(here) == self.num_envs and isinstance(source, Scenario)
-        if alike:
-            shape = (halves(base.nodes - 1), self.substeps, base.noise_dim)
-            if self._noise.shape[2:] != shape:
-                self._noise = self._room_for_noise(*shape)
-            self._half = shape[0]
-        episodes = read_episodes(source, words, self.substeps, self._noise if alike else None)
-        if worlds.shared is not source:
-            if alike:
-                worlds.share(base)
-            else:
+        if len(here) == self.num_envs and isinstance(source, Scenario):
+            if worlds.shared is not source:
+                worlds.share(source)
+            self._noise.fit(base.nodes - 1, base.noise_dim)
+            episodes = read_episodes(source, words, self.substeps, self._noise.array)
+        else:
+            episodes = read_episodes(source, words, self.substeps)
+            if worlds.shared is not source:
                 worlds.put(here, source, episodes.drawn)
-        if not alike:
-            self._keep_noise(here, episodes.noise, base)
+            columns = 3 + len(worlds.parameters.process)
+            self._noise.put(here, episodes.noise, worlds.noise_columns(base), columns)
         start = worlds.start[:, here]
         if episodes.deviations is not None:
             start = start + base.start_deviation[:, None] * episodes.deviations.T
-        self._x[:, here] = start
-        self._rounded[:, here] = start
+        self._put_at(here, start)
 
-    def _keep_noise(self, here: np.ndarray, noise: np.ndarray, base: Scenario) -> None:
-        """Put the noise of some beside that of the others, which may be longer or wider."""
-        old = self._noise
-        columns = 3 + len(self._worlds.parameters.process)
-        steps = base.nodes - 1
-        half = max(self._half, noise.shape[2])
-        if old.shape[2:] != (half, self.substeps, columns):
-            self._noise = self._room_for_noise(half, self.substeps, columns)
-            whole = np.concatenate(list(old), axis=1)
-            self._half = half
-            for k in range(min(whole.shape[1], 2 * half)):
-                self._noise[k // half, :, k % half, :, : old.shape[4]] = whole[:, k]
-        wanted = self._worlds.noise_columns(base)
-        whole = np.concatenate(list(noise), axis=1)
-        for k in range(steps):
-            self._noise[k // half, here[:, None], k % half, :, wanted] = np.moveaxis(
-                whole[:, k], 2, 0
-            ).swapaxes(0, 1)
-
-    def _give_noise(self, here: np.ndarray, noise: Any) -> None:
-        half = self._half
-        steps = int(self._worlds.steps.max())
-        shape = (self.num_envs, steps, self.substeps, self._noise.shape[4])
-        given = checked_array("noise", noise, shape)
-        for k in range(steps):
-            self._noise[k // half, here, k % half] = given[here, k]
-
-    def _room_for_noise(self, half: int, substeps: int, columns: int) -> np.ndarray:
-        return np.zeros((2, self.num_envs, half, substeps, columns), dtype=np.float32)
+    def _put_at(self, here: np.ndarray, states: np.ndarray) -> None:
+        self._x[:, here] = states
+        self._rounded[:, here] = states
 
     # -------------------------------------------------------------------------------- steps
 
@@ -331,8 +310,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             reward += goal
         np.negative(reward, out=reward)
         observation = self._observe(moved.rims)
-        if self.render_mode is not None:
-            self._record(resetting)
+        self._record(resetting, moved=True)
         if len(ended) and self.autoreset_mode is AutoresetMode.SAME_STEP:
             observation, info = self._restart(ended, over, observation, info)
         return observation, reward, over, self._no_truncation.copy(), info
@@ -377,14 +355,10 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return proximity(self._worlds.parameters, self._rounded, ARRAYS)
 
     def _noise_now(self) -> np.ndarray:
-        """Variates of this step, indexed [substep, component, car]."""
-        if self._common_step is not None:
-            half, k = divmod(self._common_step, self._half)
-            now = self._noise[half, :, k]
-        else:
-            half, k = np.divmod(np.minimum(self._step, 2 * self._half - 1), self._half)
-            now = self._noise[half, self._everyone, k]
-        return np.ascontiguousarray(now.transpose(1, 2, 0), dtype=self._dtype)
+        """Variates of this step, indexed [substep, column, car]."""
+        if self._common_step is None:
+            return self._noise.each(self._step, self._dtype)
+        return self._noise.common(self._common_step, self._dtype)
 
     def _ended(self, resetting: np.ndarray) -> np.ndarray:
         over = self._step == self._worlds.steps
@@ -407,8 +381,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for i, last in zip(ended, observation[ended], strict=True):
             final[i] = last
         self._start(ended)
-        if self.render_mode is not None:
-            self._record(ended)
+        self._record(ended, moved=False)
         _, distance, rims = self._proximity()
         fresh = self._info_at_start(distance, over)
         info = {
@@ -432,6 +405,48 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for i, entry in enumerate(seen):
             out[:, i] = entry
         return out
+
+    def _record(self, started: np.ndarray, *, moved: bool) -> None:
+        """Keep trails and worlds for pictures, if any are wanted."""
+        if self._gallery is None:
+            return
+        for i in started[started < self._gallery.shown]:
+            base = base_of(self._sources[self._source_of[i]])
+            self._shown[i] = self._worlds.scenario(int(i), base)
+        self._gallery.record(self._x.T[: self._gallery.shown], started, moved=moved)
+        if self.render_mode == "human":
+            self._gallery.draw(self._shown, self._distance < 0.0)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture (H, W, 3) uint8 for each sub-environment; None for a window.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        gallery = self._pictures()
+        return None if gallery is None else gallery.frames(self._shown, self._distance < 0.0)
+
+    def render_tiled(self) -> np.ndarray | None:
+        """All of `render`'s pictures as one, side by side: (H, W, 3) uint8; None for a window.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        gallery = self._pictures()
+        return None if gallery is None else gallery.draw(self._shown, self._distance < 0.0)
+
+    def _pictures(self) -> Gallery | None:
+        if self._gallery is None:
+            gym.logger.warn("render() without a render_mode does nothing; pass one to gym.make_vec")
+            return None
+        if not self._ready:
+            raise ResetNeeded("call reset() before render()")
+        return self._gallery
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window, if any."""
+        if self._gallery is not None:
+            self._gallery.close()
 
     def _info_at_start(self, distance: np.ndarray, here: np.ndarray) -> dict[str, Any]:
         nothing = np.zeros(self.num_envs, dtype=self._dtype)

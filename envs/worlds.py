@@ -9,7 +9,8 @@ import numpy as np
 
 MAX_RANDOM_OBSTACLES = 8
 
-#: Fields of the named scenarios; what is not given is Scenario's default.
+#: Fields of the named scenarios; what is not given is Scenario's default, or that of the one
+#: which it is `like`.
 NAMED: dict[str, dict[str, Any]] = {
     # Paper §6.3, with the clearance of the released experiment (SPEC §2).
     "paper": {
@@ -35,7 +36,49 @@ NAMED: dict[str, dict[str, Any]] = {
         "goal": (3.0, 0.0, 0.0, 0.0, 0.0),
         "obstacles": ((1.5, -0.5, 0.6), (1.5, 1.3, 0.6)),
     },
+    # The same with 0.36 m between them: the clearance rings leave ten centimetres.
+    "narrow-gap": {
+        "start": (0.0, 0.0, 0.0, 0.0, 0.0),
+        "goal": (3.0, 0.0, 0.0, 0.0, 0.0),
+        "obstacles": ((1.5, -0.78, 0.6), (1.5, 0.78, 0.6)),
+    },
+    # From a lane into a bay between two parked cars, at a right angle.
+    "parking": {
+        "start": (-1.5, 1.2, 0.0, 0.0, 0.0),
+        "goal": (0.0, -0.3, -1.5707963267948966, 0.0, 0.0),
+        "obstacles": (
+            (-0.55, -0.35, 0.2),
+            (-0.55, 0.05, 0.2),
+            (0.55, -0.35, 0.2),
+            (0.55, 0.05, 0.2),
+        ),
+        "horizon": 6.0,
+        "nodes": 49,
+    },
+    # Round a wall of three posts and back.
+    "u-turn": {
+        "start": (0.0, 0.0, 0.0, 0.0, 0.0),
+        "goal": (0.0, 1.6, 3.141592653589793, 0.0, 0.0),
+        "obstacles": ((0.4, 0.8, 0.25), (0.9, 0.8, 0.25), (1.4, 0.8, 0.25)),
+        "horizon": 8.0,
+        "nodes": 65,
+    },
+    # The paper's world on a road five times as slippery.
+    "icy": {"like": "paper", "slip": (0.5, 0.05)},
+    # The paper's world, the start known to 5 cm and 3°, the pose disturbed on the way.
+    "uncertain": {
+        "like": "paper",
+        "start_deviation": (0.05, 0.05, 0.05, 0.0, 0.0),
+        "process_noise": (0.02, 0.02, 0.02, 0.0, 0.0),
+    },
 }
+
+
+def named_world(name: str) -> dict[str, Any]:
+    """Fields of a named scenario, with those that it shares with another."""
+    fields = dict(NAMED[name])
+    like = fields.pop("like", None)
+    return fields if like is None else {**NAMED[like], **fields}
 
 
 def random_world(seed: int, obstacles: int | None, turned: bool) -> dict[str, Any]:

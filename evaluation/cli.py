@@ -1,4 +1,4 @@
-"""The command line, `slipcar compare|frontier|plan|simulate|train`: each a thin call of a function.
+"""The command line, `slipcar COMMAND`: each command a thin call of a function.
 
 Bad values end in one line on the standard error and exit code 2; a plan that did not converge
 or a row that failed in exit code 1; an interruption in 130.
@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 #: help should not take a second.
 COMMANDS = {
     "compare": ("cli_compare", "compare", "the table and figures: SCP, feedback and PPO"),
+    "dataset": ("cli_dataset", "dataset", "write episodes of any controller as a Minari dataset"),
     "frontier": ("cli_frontier", "frontier", "what safety costs: effort against collision rate"),
     "plan": ("cli_plan", "plan", "plan one scenario: iterations, certificate, figures"),
     "simulate": ("cli_simulate", "simulate", "drive a few episodes; show, draw or film them"),

@@ -14,7 +14,10 @@ from slipcar.envs import Scenario, SlipCarEnv
 
 pygame = pytest.importorskip("pygame")
 
-from slipcar.envs.render import CAR_LENGTH, STRIP, WIDTH, Screen, View, grid_step, speed_colours  # noqa: E402
+from slipcar.envs.overlay import RADIUS, Overlay  # noqa: E402
+from slipcar.envs.render import STRIP, WIDTH, Screen  # noqa: E402
+from slipcar.envs.sprites import PLAN, speed_colours  # noqa: E402
+from slipcar.envs.view import CAR_LENGTH, grid_step  # noqa: E402
 
 PAPER = Scenario.named("paper")
 WORLDS = [Scenario.named(name) for name in Scenario.names()]
@@ -56,7 +59,7 @@ def centre_of_change(a, b):
 
 @pytest.mark.parametrize("scenario", WORLDS + RANDOM + FAR)
 def test_the_view_shows_start_goal_and_clearance_rings_with_a_margin(scenario):
-    view = View.of(scenario)
+    view = screen(scenario).view
     points = [scenario.start[:2], scenario.goal[:2]]
     for x, y, radius in scenario.obstacles:
         reach = radius + scenario.clearance
@@ -69,7 +72,7 @@ def test_the_view_shows_start_goal_and_clearance_rings_with_a_margin(scenario):
 
 @pytest.mark.parametrize("scenario", WORLDS + FAR)
 def test_scales_are_equal_and_y_points_up(scenario):
-    view = View.of(scenario)
+    view = screen(scenario).view
     metre = 0.1 / view.scale * 100
     origin, right, up = view.pixels(scenario.start[:2] + metre * np.array([[0, 0], [1, 0], [0, 1]]))
     np.testing.assert_allclose(right - origin, [10, 0], atol=1e-5)
@@ -192,6 +195,95 @@ def test_odd_headings_are_no_trouble(heading):
     assert screen().draw(trail(at(1, 1, heading)), collided=False) is not None
 
 
+# --------------------------------------------------------------------- trails piece by piece
+
+
+def wander(rng, nodes, scenario=PAPER):
+    path = np.zeros((nodes, 5))
+    path[:, :2] = rng.uniform(-0.5, 3.0, (nodes, 2))
+    path[:, 2:] = rng.normal(size=(nodes, 3))
+    path[0] = scenario.start
+    return path
+
+
+def test_frames_do_not_depend_on_what_was_drawn_before():
+    """Trails grow, shrink, restart, part ways and are written over; a new screen draws the same."""
+    rng, drawn = np.random.default_rng(0), screen()
+    one, other = wander(rng, 12), wander(rng, 12)
+    parted = np.vstack([one[:6], other[6:]])
+    plans = Overlay(one[:, :2]), Overlay(other[:, :2]), None
+    steps = [(one, 1), (one, 2), (one, 5), (one, 6), (one, 12), (parted, 8), (one, 3), (other, 12)]
+    steps += [(one, 1), (parted, 12), (one, 12), (one, 12)]
+    scratch = np.empty((12, 5))  # a caller may use the same memory again
+    for i, (path, k) in enumerate(steps):
+        overlay = plans[(i // 4) % 3]
+        scratch[:k] = path[:k]
+        frame = drawn.draw(scratch[:k], collided=bool(i % 2), overlay=overlay)
+        fresh = screen().draw(path[:k], collided=bool(i % 2), overlay=overlay)
+        np.testing.assert_array_equal(frame, fresh)
+
+
+def test_another_world_is_drawn_in_frames_of_the_same_size():
+    drawn, other = screen(), Scenario.named("slalom")
+    before = drawn.draw(trail(PAPER.start), collided=False)
+    drawn.enter(other)
+    assert drawn.scenario is other
+    after = drawn.draw(trail(other.start), collided=False)
+    assert after.shape == before.shape
+    assert (after != before).any()
+    drawn.enter(PAPER)
+    np.testing.assert_array_equal(drawn.draw(trail(PAPER.start), collided=False), before)
+
+
+# ------------------------------------------------------------------------------------ overlays
+
+
+def test_the_planned_path_is_drawn_where_it_is_and_under_the_car():
+    drawn = screen()
+    parked = trail(at(2.5, 0.2))
+    plan = Overlay(np.array([[1.8, 0.9, 0.0], [2.4, 0.9, 0.0], [2.4, 0.2, 0.0]]))
+    without = drawn.draw(parked, collided=False)
+    frame = drawn.draw(parked, collided=False, overlay=plan)
+    for position in ((2.0, 0.9), (2.3, 0.9), (2.4, 0.6)):
+        column, row = np.round(drawn.view.pixels(np.array(position))).astype(int)
+        near = frame[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).astype(int)
+        assert np.abs(near - PLAN).sum(axis=1).min() < 60
+        assert (without[row, column] > 200).all()
+    column, row = np.round(drawn.view.pixels(np.array([2.5, 0.2]))).astype(int)
+    np.testing.assert_array_equal(frame[row, column], without[row, column])
+    np.testing.assert_array_equal(drawn.draw(parked, collided=False), without)
+
+
+@pytest.mark.parametrize("towards", [(0.0, 0.0), (0.7, 0.1), (-0.1, -0.6)])
+def test_the_tinted_region_is_the_95_percent_ellipse_moved_along_the_path(towards):
+    drawn = screen()
+    S = np.array([[0.02, 0.008], [0.008, 0.006]])
+    path = np.array([1.9, 1.1]) + np.array([[0.0, 0.0], towards])
+    parked = trail(at(0.0, 3.0))
+    without = drawn.draw(parked, collided=False)
+    frame = drawn.draw(parked, collided=False, overlay=Overlay(path, np.stack([S, S])))
+    rows, columns = np.mgrid[120 : frame.shape[0] - STRIP : 2, 0:WIDTH:2]
+    distance = np.full(rows.shape, np.inf)
+    for share in np.linspace(0.0, 1.0, 41):
+        centre = drawn.view.pixels(path[0] + share * (path[1] - path[0]))
+        offset = np.stack([columns, rows], axis=-1) - centre
+        offset = offset * (1.0, -1.0) / drawn.view.scale
+        squared = np.einsum("...i,ij,...j", offset, np.linalg.inv(S), offset)
+        distance = np.minimum(distance, np.sqrt(squared))
+    changed = (frame != without).any(axis=-1)[rows, columns]
+    pixel = 2.0 / (drawn.view.scale * np.sqrt(np.linalg.eigvalsh(S)[0]))
+    assert changed[distance < RADIUS - pixel].all()
+    assert not changed[distance > RADIUS + pixel].any()
+
+
+@pytest.mark.parametrize("far", [1e3, 1e9])
+def test_an_overlay_out_of_sight_is_no_trouble(far):
+    plan = Overlay(np.array([[0.0, 0.0], [far, -far]]), far**2 * np.stack([np.eye(2)] * 2))
+    assert screen().draw(trail(PAPER.start), collided=False, overlay=plan) is not None
+    away = Overlay(np.full((3, 2), far), np.stack([np.eye(2)] * 3))
+    assert screen().draw(trail(PAPER.start), collided=False, overlay=away) is not None
+
+
 # ------------------------------------------------------------------------------- the environment
 
 
@@ -296,3 +388,31 @@ def test_a_window_without_a_display_is_an_error_that_says_what_to_do(monkeypatch
     env = SlipCarEnv(render_mode="human")
     with pytest.raises(Error, match=r"found no display .*use render_mode='rgb_array'"):
         env.reset(seed=0)
+
+
+# -------------------------------------------------------------------------------------- the film
+
+
+def test_gymnasium_records_videos_of_an_episode(tmp_path):
+    pytest.importorskip("moviepy")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    world = Scenario.named("open").replace(nodes=7)
+    env = gym.make("slipcar.envs:SlipCar-v0", scenario=world, render_mode="rgb_array")
+    env = gym.wrappers.RecordVideo(env, str(tmp_path / "videos"), disable_logger=True)
+    env.reset(seed=0)
+    last = env.render()
+    for _ in range(world.nodes - 1):
+        env.step(np.array([0.9, 0.2]))
+        last = env.render()
+    env.close()
+    (film,) = tmp_path.glob("videos/*.mp4")
+    pictures = ffmpeg.read_frames(str(film))
+    about = next(pictures)
+    assert about["size"] == last.shape[1::-1]
+    assert about["fps"] == env.metadata["render_fps"]
+    decoded = [np.frombuffer(raw, np.uint8).reshape(last.shape).astype(int) for raw in pictures]
+    assert len(decoded) == world.nodes
+    # What moves tells pictures apart: the last one decoded is the last one drawn.
+    difference = [np.abs(picture - last).mean() for picture in decoded]
+    assert np.argmin(difference) == world.nodes - 1
+    assert difference[-1] < 4.0

@@ -270,10 +270,9 @@ def test_steps_need_a_running_episode():
 
 
 def test_unknown_reset_options_are_refused():
-    with pytest.raises(
-        ValueError, match=r"unknown reset options \['start'\]; known are \['scenario', 'noise'\]"
-    ):
-        SlipCarEnv().reset(options={"start": 0})
+    message = r"unknown reset options \['begin'\]; known are \['scenario', 'start', 'noise'\]"
+    with pytest.raises(ValueError, match=message):
+        SlipCarEnv().reset(options={"begin": 0})
 
 
 def test_a_negative_seed_is_refused():

@@ -249,9 +249,9 @@ def test_bad_actions(actions, message):
     ("arguments", "error", "message"),
     [
         (
-            {"options": {"start": 1}},
+            {"options": {"begin": 1}},
             ValueError,
-            r"unknown reset options \['start'\]; known are \['reset_mask', 'scenario', 'noise'\]",
+            r"unknown reset options \['begin'\]; known are \['reset_mask', 'scenario', 'start', 'n",
         ),
         ({"options": {"reset_mask": np.ones(2, bool)}}, ValueError, r"shape \(3,\).*not bool.*2"),
         ({"options": {"reset_mask": np.zeros(3, bool)}}, ValueError, "at least one True"),

@@ -1,0 +1,99 @@
+"""The variates of a fleet's running episodes, from which each step takes its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from slipcar.envs.episode import halves
+from slipcar.envs.validate import checked_array
+
+
+class NoiseStore:
+    """Standard normal variates of episodes, in halves (:func:`slipcar.envs.episode.halves`).
+
+    Attributes:
+        array: (2, count, half, substeps, columns) float32.
+
+    Args:
+        count: how many episodes run side by side.
+        steps: control steps of each, N − 1.
+        substeps: Euler–Maruyama steps in each.
+        columns: Brownian motions, 3 + p.
+    """
+
+    def __init__(self, count: int, steps: int, substeps: int, columns: int) -> None:
+        self._count, self._substeps = count, substeps
+        self._everyone = np.arange(count)
+        self.array: np.ndarray = np.empty((2, 0, 0, 0, 0), dtype=np.float32)
+        self.fit(steps, columns)
+
+    @property
+    def half(self) -> int:
+        """Steps in either half."""
+        return self.array.shape[2]
+
+    def fit(self, steps: int, columns: int) -> None:
+        """Room for episodes of just so many steps and motions; what was there is lost."""
+        shape = (2, self._count, halves(steps), self._substeps, columns)
+        if self.array.shape != shape:
+            self.array = np.zeros(shape, dtype=np.float32)
+
+    def put(self, here: np.ndarray, noise: np.ndarray, where: list[int], columns: int) -> None:
+        """New noise for some, beside that of others, which may be longer or have more columns.
+
+        Args:
+            here: which episodes, indices.
+            noise: in halves, (2, len(here), half, substeps, c).
+            where: to which columns its own belong, c of them.
+            columns: how many there are in all.
+        """
+        half = max(self.half, noise.shape[2])
+        if (half, columns) != (self.half, self.array.shape[4]):
+            old = self._whole(self.array)
+            self.fit(2 * half, columns)
+            self._give(self._everyone, old, list(range(old.shape[3])))
+        self._give(here, self._whole(noise), where)
+
+    def give(self, here: np.ndarray, noise: Any, steps: int) -> None:
+        """Noise from outside for some.
+
+        Args:
+            here: which episodes, indices.
+            noise: (count, steps, substeps, columns).
+            steps: control steps of the longest episode.
+
+        Raises:
+            ValueError: for another shape or a non-finite entry.
+        """
+        shape = (self._count, steps, self._substeps, self.array.shape[4])
+        given = checked_array("noise", noise, shape)
+        self._give(here, given[here], list(range(shape[3])))
+
+    def common(self, k: int, dtype: Any) -> np.ndarray:
+        """Variates of step k of all, indexed [substep, column, episode]."""
+        half, k = divmod(k, self.half)
+        return np.ascontiguousarray(self.array[half, :, k].transpose(1, 2, 0), dtype=dtype)
+
+    def each(self, steps: np.ndarray, dtype: Any) -> np.ndarray:
+        """Variates of step `steps[i]` of episode i, indexed [substep, column, episode]."""
+        half, k = np.divmod(np.minimum(steps, 2 * self.half - 1), self.half)
+        now = self.array[half, self._everyone, k]
+        return np.ascontiguousarray(now.transpose(1, 2, 0), dtype=dtype)
+
+    @staticmethod
+    def _whole(noise: np.ndarray) -> np.ndarray:
+        return np.concatenate(list(noise), axis=1)
+
+    def _give(self, here: np.ndarray, noise: np.ndarray, where: list[int]) -> None:
+        """Noise (len(here), steps, substeps, c), one step after the other."""
+        half = self.half
+        for first in (0, half):
+            part = noise[:, first : first + half]
+            block = self.array[first // half]
+            if where == list(range(block.shape[3])):
+                block[here, : part.shape[1]] = part
+            else:
+                for column, source in zip(where, np.moveaxis(part, 3, 0), strict=True):
+                    block[here, : part.shape[1], :, column] = source
