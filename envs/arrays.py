@@ -95,7 +95,17 @@ def functions_of(component: Any) -> Functions:
         return ARRAYS
     if array_api_compat.is_torch_array(component):
         return tensor_functions()
-    raise TypeError(f"no floats, NumPy arrays or Torch tensors: {type(component).__name__}")
+    xp = array_namespace(component)
+    return Functions(
+        cos=xp.cos,
+        sin=xp.sin,
+        sqrt=xp.sqrt,
+        positive=lambda value: xp.clip(value, min=0.0),
+        clip=xp.clip,
+        bounded=lambda values, limit: [xp.clip(value, -limit, limit) for value in values],
+        total=lambda values: xp.sum(values, axis=0),
+        smallest=lambda values: xp.min(values, axis=0),
+    )
 
 
 @functools.cache

@@ -70,6 +70,7 @@ class Worlds:
 
     def __init__(self, count: int, dtype: type, scenario: Scenario) -> None:
         self._count, self._dtype = count, dtype
+        self._drawn: Draw | None = None
         self.share(scenario)
 
     def share(self, scenario: Scenario) -> None:
@@ -85,6 +86,8 @@ class Worlds:
     def put(self, here: np.ndarray, source: Source, drawn: Draw | None) -> None:
         """Put the cars `here` (indices) into a scenario, or into worlds drawn from a family."""
         base = base_of(source)
+        if drawn is not None:
+            self._keep(here, drawn)
         self._part(most_obstacles(source), {i for i, _ in base.process})
         p = self.parameters
         nodes = base.nodes
@@ -117,19 +120,32 @@ class Worlds:
             column[:k, here] = np.where(there, value, absent).T
             column[k:, here] = absent
 
-    def scenario(self, i: int, base: Scenario) -> Scenario:
-        """The world of car i as a scenario; what a family does not vary comes from `base`."""
-        if self.shared is not None:
-            return self.shared
-        p = self.parameters
-        rows = np.stack([column[:, i] for column in p.obstacles[:3]], axis=-1).astype(float)
-        return base.replace(
-            start=self.start[:, i],
-            goal=[goal[i] for goal in p.goal],
-            horizon=float(p.horizon[i]),
-            slip=[slip[i] for slip in p.slip],
-            obstacles=rows[np.isfinite(rows[:, 2])],
+    def scenario(self, i: int, source: Source) -> Scenario:
+        """The world of car i, which was put into one of `source`."""
+        if isinstance(source, Scenario):
+            return source
+        assert self._drawn is not None
+        start, goal, horizon, slip, obstacles, counts = (field[i] for field in self._drawn)
+        return source.base.replace(
+            start=start,
+            goal=goal,
+            horizon=float(horizon),
+            slip=slip,
+            obstacles=obstacles[:counts],
         )
+
+    def _keep(self, here: np.ndarray, drawn: Draw) -> None:
+        """Remember worlds as they were drawn: the arrays of a step are rounded."""
+        most = drawn.obstacles.shape[1]
+        old = self._drawn
+        if old is None or old.obstacles.shape[1] < most:
+            fields = [np.zeros((self._count, *field.shape[1:]), field.dtype) for field in drawn]
+            self._drawn = Draw(*fields)
+            if old is not None:
+                for new, field in zip(self._drawn, old, strict=True):
+                    new[tuple(slice(n) for n in field.shape)] = field
+        for kept, field in zip(self._drawn, drawn, strict=True):
+            kept[(here, *(slice(n) for n in field.shape[1:]))] = field
 
     def noise_columns(self, base: Scenario) -> list[int]:
         """Where the variates of a scenario's noise belong among those of the fleet's."""

@@ -141,10 +141,12 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     @property
     def scenarios(self) -> list[Scenario]:
         """The world that each sub-environment is in, `num_envs` of them."""
-        if self._worlds.shared is not None:
-            return [self._worlds.shared] * self.num_envs
-        bases = [base_of(source) for source in self._sources]
-        return [self._worlds.scenario(i, bases[s]) for i, s in enumerate(self._source_of)]
+        if not self._ready:
+            return [base_of(self._sources[0])] * self.num_envs
+        return [self._world(i) for i in range(self.num_envs)]
+
+    def _world(self, i: int) -> Scenario:
+        return self._worlds.scenario(i, self._sources[self._source_of[i]])
 
     @property
     def states(self) -> np.ndarray:
@@ -411,8 +413,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self._gallery is None:
             return
         for i in started[started < self._gallery.shown]:
-            base = base_of(self._sources[self._source_of[i]])
-            self._shown[i] = self._worlds.scenario(int(i), base)
+            self._shown[i] = self._world(int(i))
         self._gallery.record(self._x.T[: self._gallery.shown], started, moved=moved)
         if self.render_mode == "human":
             self._gallery.draw(self._shown, self._distance < 0.0)

@@ -1,0 +1,277 @@
+"""Paths and their costs in Torch: many at once on any device, and differentiable.
+
+    J(u) = E[ effort + obstacle + goal ],     ∂J/∂u ≈ mean of ∂cost/∂u over paths
+
+The noise of a path is drawn before it is driven and does not depend on the controls, so a path's
+cost is a differentiable function of them (or of a policy's weights), and the mean of its gradients
+is an unbiased estimate of the gradient of the expected cost: the pathwise, or reparametrised, one.
+Collisions have no such gradient: how many there are jumps from path to path.
+
+    noise = draw_noise(scenario, paths=4096, seed=0, device="cuda")
+    path_costs(scenario, controls, noise).total.mean().backward()
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+from slipcar.envs import observation as layouts
+from slipcar.envs.arrays import tensor_functions
+from slipcar.envs.car import CONTROL_DIM, STATE_DIM
+from slipcar.envs.parameters import Parameters
+from slipcar.envs.scenario import Scenario
+from slipcar.envs.torch_backend import (
+    checked_device,
+    checked_dtype,
+    compiled,
+    tensor,
+    torch_module,
+)
+from slipcar.envs.transition import Moved, goal_cost, proximity, step
+from slipcar.envs.validate import checked_int
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+#: Controls (paths, 2) [m/s², rad/s²] from the time [s] and the states (paths, 5).
+Policy: TypeAlias = "Callable[[float, Tensor], Tensor]"
+
+
+class PathCosts(NamedTuple):
+    """What each path cost (SPEC §2), and where it ended.
+
+    Attributes:
+        effort: Σ dt ‖u_k‖², (paths,).
+        obstacle: Σ dt λ Σ_o max(0, c_o)², (paths,).
+        goal: (x_N − x^f)ᵀ W (x_N − x^f), (paths,).
+        total: their sum, (paths,).
+        distance: the smallest signed distance to a rim at any node [m], (paths,); negative is a
+            collision.
+        state: x_N, (paths, 5).
+    """
+
+    effort: Tensor
+    obstacle: Tensor
+    goal: Tensor
+    total: Tensor
+    distance: Tensor
+    state: Tensor
+
+
+def draw_noise(
+    scenario: Scenario,
+    paths: int,
+    substeps: int = 1,
+    seed: int | torch.Generator | None = None,
+    device: Any = "cpu",
+    dtype: Any = "float32",
+) -> Tensor:
+    """Standard normal variates of many paths, drawn on the device.
+
+    Args:
+        scenario: says how many control steps and Brownian motions there are.
+        paths: how many, at least 1.
+        substeps: Euler–Maruyama steps in each control interval.
+        seed: the same seed on the same kind of device gives the same variates; a generator of that
+            device goes on from where it is; None takes Torch's own.
+        device: anything `torch.device` takes.
+        dtype: `float32` or `float64`.
+
+    Returns:
+        (N − 1, substeps, 3 + p, paths).
+
+    Raises:
+        ValueError: for a bad number, dtype or seed, or a device that is not there.
+        ImportError: if PyTorch is not installed.
+    """
+    where, kind = checked_device(device), checked_dtype(dtype)
+    shape = (
+        scenario.nodes - 1,
+        checked_int("substeps", substeps, at_least=1),
+        scenario.noise_dim,
+        checked_int("paths", paths, at_least=1),
+    )
+    return _normals(shape, seed, where, kind)
+
+
+def draw_starts(
+    scenario: Scenario,
+    paths: int,
+    seed: int | torch.Generator | None = None,
+    device: Any = "cpu",
+    dtype: Any = "float32",
+) -> Tensor:
+    """States at the start of many paths, (paths, 5): normal round the scenario's.
+
+    Arguments and errors are those of :func:`draw_noise`. The same seed there and here would tie
+    the start to the noise: pass a generator to both, or two seeds.
+    """
+    where, kind = checked_device(device), checked_dtype(dtype)
+    shape = (checked_int("paths", paths, at_least=1), STATE_DIM)
+    deviation = tensor(scenario.start_deviation, where, kind)
+    return tensor(scenario.start, where, kind) + deviation * _normals(shape, seed, where, kind)
+
+
+def path_costs(
+    scenario: Scenario,
+    controls: Tensor | Policy,
+    noise: Tensor,
+    start: Any = None,
+    *,
+    compile: bool = False,
+) -> PathCosts:
+    """Drive many paths and add up what they cost; gradients flow through all but `distance`'s kinks.
+
+    Device and dtype are the noise's. Controls are limited to the scenario's bounds as in the
+    environment, and have no gradient beyond them.
+
+    Args:
+        scenario: the world.
+        controls: in physical units, (N − 1, 2) for all paths; or a function of the time [s] and
+            the states (paths, 5) that gives (paths, 2). See :func:`observed` for networks.
+        noise: (N − 1, substeps, 3 + p, paths), as :func:`draw_noise` gives it.
+        start: x(0), (5,) or (paths, 5); None is the scenario's.
+        compile: fuse each interval into few kernels with `torch.compile`, which takes seconds
+            once. Worth it from some 10⁵ paths.
+
+    Raises:
+        ValueError: for wrong shapes or types, naming them; or if the scenario's start is uncertain
+            and none is given.
+        RuntimeError: if `compile` does not work on this machine.
+        ImportError: if PyTorch is not installed.
+    """
+    torch = torch_module()
+    steps = scenario.nodes - 1
+    _check_noise(scenario, noise)
+    paths, where = noise.shape[3], {"device": noise.device, "dtype": noise.dtype}
+    x = _starts(scenario, start, noise)
+    if not callable(controls):
+        if not torch.is_tensor(controls):
+            raise ValueError(f"controls must be a tensor or a function, not {type(controls)}")
+        if controls.shape != (steps, CONTROL_DIM):
+            raise ValueError(
+                f"controls must have shape {(steps, CONTROL_DIM)}, not {tuple(controls.shape)}"
+            )
+        controls = controls.to(**where)
+    limits = None if scenario.control_bounds is None else scenario.control_bounds.tolist()
+    p = Parameters.like(x[0], scenario)
+    interval = _interval(noise.device if compile else None)
+    effort = obstacle = torch.zeros(paths, **where)
+    distance = torch.full((paths,), torch.inf, **where)
+    for k in range(steps):
+        if callable(controls):
+            u = controls(k * scenario.dt, torch.stack(list(x), dim=-1))
+            if not torch.is_tensor(u) or u.shape != (paths, CONTROL_DIM):
+                given = tuple(u.shape) if torch.is_tensor(u) else type(u)
+                raise ValueError(f"the policy must give controls {(paths, 2)}, not {given}")
+            u = u.to(noise.dtype).unbind(dim=-1)
+        else:
+            u = controls[k].unbind()
+        if limits is not None:
+            u = [torch.clamp(a, -most, most) for a, most in zip(u, limits, strict=True)]
+        moved = interval(p, x, u, noise[k])
+        x = moved.state
+        effort, obstacle = effort + moved.effort, obstacle + moved.obstacle
+        distance = torch.minimum(distance, moved.distance)
+    goal = goal_cost(p, x)
+    total = effort + obstacle + goal
+    return PathCosts(effort, obstacle, goal, total, distance, torch.stack(list(x), dim=-1))
+
+
+def observed(
+    scenario: Scenario,
+    network: Callable[[Tensor], Tensor],
+    observation: str = "features",
+    obstacle_slots: int = 0,
+) -> Policy:
+    """A network on the environment's observations as a policy for :func:`path_costs`.
+
+    Args:
+        scenario: the world.
+        network: observations (paths, d) in the states' dtype to actions (paths, 2), which are
+            limited to [−1, 1] and scaled by the scenario's control bounds.
+        observation: `"features"`, `"state"` or `"egocentric"`.
+        obstacle_slots: how many of the nearest obstacles are seen.
+
+    Raises:
+        ValueError: for an unknown kind or a bad number, or a scenario without control bounds.
+    """
+    torch = torch_module()
+    layout = layouts.Layout(observation, obstacle_slots)
+    scale = scenario.action_scale
+
+    def policy(t: float, x: Tensor) -> Tensor:
+        seen = observe(layout, Parameters.like(x[:, 0], scenario), t, x.unbind(dim=-1))
+        return torch.clamp(network(seen), -1.0, 1.0) * tensor(scale, x.device, x.dtype)
+
+    return policy
+
+
+def observe(layout: layouts.Layout, p: Parameters, t: Any, x: Any, rims: Any = None) -> Tensor:
+    """Observations (paths, d) of states' five components, in their dtype.
+
+    Args:
+        layout: which ones.
+        p: for components of this kind.
+        t: time [s], a float or a tensor.
+        x: five tensors (paths,).
+        rims: from `transition.proximity`, where it is known.
+    """
+    torch, functions = torch_module(), tensor_functions()
+    if rims is None and layout.slots:
+        rims = proximity(p, x, functions)[2]
+    seen = layouts.entries(layout, p, t, x, rims, functions)
+    # Some are the same for all: the time, and what worlds share.
+    columns = [e if torch.is_tensor(e) else torch.full_like(x[0], e) for e in seen]
+    return torch.stack([column.expand_as(x[0]) for column in columns], dim=-1)
+
+
+@functools.cache
+def _interval(device: torch.device | None = None) -> Callable[..., Moved]:
+    """`transition.step` for tensors, compiled if a device is given."""
+    interval = functools.partial(step, functions=tensor_functions())
+    return interval if device is None else compiled(interval, device)
+
+
+def _normals(shape: Any, seed: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
+    torch = torch_module()
+    generator = seed
+    if not isinstance(seed, torch.Generator) and seed is not None:
+        checked_int("seed", seed, at_least=0)
+        generator = torch.Generator(device).manual_seed(int(seed))
+    return torch.randn(shape, generator=generator, device=device, dtype=dtype)
+
+
+def _check_noise(scenario: Scenario, noise: Any) -> None:
+    torch = torch_module()
+    if not torch.is_tensor(noise) or not noise.is_floating_point():
+        kind = noise.dtype if torch.is_tensor(noise) else type(noise).__name__
+        raise ValueError(f"noise must be a tensor of floating-point numbers, not {kind}")
+    wanted = (scenario.nodes - 1, scenario.noise_dim)
+    if noise.ndim != 4 or (noise.shape[0], noise.shape[2]) != wanted or 0 in noise.shape:
+        raise ValueError(
+            f"noise must have shape ({wanted[0]}, substeps, {wanted[1]}, paths), "
+            f"not {tuple(noise.shape)}"
+        )
+
+
+def _starts(scenario: Scenario, start: Any, noise: Tensor) -> list[Tensor]:
+    """Five components (paths,)."""
+    torch = torch_module()
+    paths = noise.shape[3]
+    if start is None:
+        if scenario.start_deviation.any():
+            raise ValueError(
+                "the scenario's start is uncertain (start_deviation > 0): pass "
+                "start=draw_starts(...), or start=scenario.start for its mean"
+            )
+        start = scenario.start
+    if not torch.is_tensor(start):
+        start = tensor(start, noise.device, noise.dtype)
+    if start.shape not in ((STATE_DIM,), (paths, STATE_DIM)):
+        raise ValueError(f"start must have shape (5,) or ({paths}, 5), not {tuple(start.shape)}")
+    start = start.to(noise.device, noise.dtype).expand(paths, STATE_DIM)
+    return [component.contiguous() for component in start.unbind(dim=-1)]
