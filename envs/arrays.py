@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -93,7 +94,7 @@ def functions_of(component: Any) -> Functions:
         return FLOATS
     if isinstance(component, np.ndarray):
         return ARRAYS
-    if array_api_compat.is_torch_array(component):
+    if _all_tensors((component,)):
         return tensor_functions()
     xp = array_namespace(component)
     return Functions(
@@ -129,11 +130,20 @@ def array_namespace(*arrays: Any) -> Any:
     """NumPy's or Torch's functions under the array API's names.
 
     `array_api_compat.array_namespace` inspects every argument anew, which takes longer than
-    the arithmetic of a single path; NumPy arrays, and scalars of NumPy, need no inspection.
+    the arithmetic of a single path; NumPy's arrays and scalars and Torch's tensors need none.
 
     Raises:
         TypeError: if the arguments are no arrays, or of different kinds.
     """
     if all(isinstance(array, (np.ndarray, np.generic)) for array in arrays):
         return array_api_compat.numpy
+    if _all_tensors(arrays):
+        from array_api_compat import torch as namespace
+
+        return namespace
     return array_api_compat.array_namespace(*arrays)
+
+
+def _all_tensors(arrays: Sequence[Any]) -> bool:
+    torch = sys.modules.get("torch")  # whoever has a tensor has imported it
+    return torch is not None and all(isinstance(array, torch.Tensor) for array in arrays)

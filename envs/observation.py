@@ -36,6 +36,7 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from slipcar.envs.arrays import FLOATS, Functions, array_namespace, functions_of
+from slipcar.envs.nearest import nearest
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.validate import checked_int
 
@@ -143,7 +144,7 @@ class Layout:
 
 def entries(
     layout: Layout, p: Parameters, t: Any, x: Any, rims: Any, functions: Functions
-) -> list[Any]:
+) -> tuple[list[Any], Any | None]:
     """The entries of an observation, on components (:mod:`slipcar.envs.arrays`).
 
     Args:
@@ -154,11 +155,15 @@ def entries(
         rims: distance to every obstacle's rim [m], as `transition.proximity` gives it; it is not
             looked at without slots.
         functions: for this kind of component.
+
+    Returns:
+        The entries, and, for NumPy arrays, a block (cars, m) of those that follow; what is missing
+        at the end is zero.
     """
     clip = functions.clip
     if layout.kind == "state":
-        seen = [*functions.bounded(x, _WIDE), t]
-        return seen + _slots(layout, p, x, rims, functions, None)
+        shown, block = _obstacles(layout, p, x, rims, functions, None)
+        return [*functions.bounded(x, _WIDE), t, *shown], block
     theta, v, omega = x[2], x[3], x[4]
     dx, dy, turn = p.goal[0] - x[0], p.goal[1] - x[1], p.goal[2] - theta
     cos, sin = functions.cos(theta), functions.sin(theta)
@@ -180,7 +185,8 @@ def entries(
     ]
     if layout.kind == "egocentric":
         seen += [to_go / _TIME_SCALE, p.slip[0] / _SLIP_SCALE[0], p.slip[1] / _SLIP_SCALE[1]]
-    return seen + _slots(layout, p, x, rims, functions, frame)
+    shown, block = _obstacles(layout, p, x, rims, functions, frame)
+    return seen + shown, block
 
 
 def observe(
@@ -208,10 +214,24 @@ def observe(
     functions = functions_of(components[0])
     rims = proximity(p, components, functions)[2] if slots else []
     seen = entries(layout, p, np.asarray(t, dtype=np.float64), components, rims, functions)
-    out = np.empty((*states.shape[:-1], layout.size), dtype=np.float32)
+    out = filled(layout, states.shape[:-1], *seen)
+    return out.reshape(*x.shape[:-1], layout.size)
+
+
+def filled(
+    layout: Layout, shape: tuple[int, ...], seen: list[Any], block: np.ndarray | None
+) -> np.ndarray:
+    """Observations (*shape, size) float32 from what :func:`entries` gave."""
+    out = np.empty((*shape, layout.size), dtype=np.float32)
     for i, entry in enumerate(seen):
         out[..., i] = entry
-    return out.reshape(*x.shape[:-1], layout.size)
+    told = len(seen)
+    if block is not None:
+        out[..., told : told + block.shape[-1]] = block
+        told += block.shape[-1]
+    if told < layout.size:
+        out[..., told:] = 0.0
+    return out
 
 
 def observation_space(scenario: Scenario, kind: str, slots: int = 0) -> Box:
@@ -255,42 +275,32 @@ def describe(kind: str, slots: int = 0) -> dict[str, Any]:
     return {"kind": check_kind(kind), "entries": list(Layout(kind, slots).entries)}
 
 
-def _slots(
+def _obstacles(
     layout: Layout, p: Parameters, x: Any, rims: Any, functions: Functions, frame: Any
-) -> list[Any]:
-    """Entries of the obstacles shown, the nearest first."""
-    if not layout.slots:
-        return []
-    shown: list[Any] = []
-    for near in _nearest(layout.slots, p, x, rims, functions):
-        dx, dy, radius, present = near
-        if frame is not None:
-            dx, dy = _turned(frame, dx, dy)
-        shown += [functions.clip(dx, -_WIDE, _WIDE), functions.clip(dy, -_WIDE, _WIDE)]
-        shown += [radius, present]
-    nothing = 0.0 * x[0]
-    return shown + [nothing] * (len(SLOT) * layout.slots - len(shown))
-
-
-def _nearest(
-    slots: int, p: Parameters, x: Any, rims: Any, functions: Functions
-) -> list[tuple[Any, Any, Any, Any]]:
-    """(dx, dy, radius, present) of at most `slots` obstacles, by distance of their rims."""
+) -> tuple[list[Any], Any | None]:
+    """Entries of the obstacles shown; see :func:`slipcar.envs.nearest.nearest`."""
+    if not layout.slots or len(p.obstacles[0]) == 0:
+        return [], None
     if functions is FLOATS:
-        order = sorted(range(len(rims)), key=rims.__getitem__)[:slots]
-        rows = [[column[i] for column in p.obstacles] for i in order]
-        return [(row[0] - x[0], row[1] - x[1], row[2], 1.0) for row in rows]
-    xp = array_namespace(rims)
-    if rims.shape[0] == 0:
-        return []
-    order = xp.argsort(rims, axis=0)[:slots]
-    columns = (p.obstacles[0] - x[0], p.obstacles[1] - x[1], p.obstacles[2] + 0.0 * x[0])
-    # A fleet's worlds are filled up with obstacles infinitely far away.
-    present = xp.isfinite(xp.take_along_axis(rims, order, axis=0))
-    shown = [xp.take_along_axis(column, order, axis=0) for column in columns]
-    dx, dy, radius = (xp.where(present, column, xp.zeros_like(column)) for column in shown)
-    mask = xp.astype(present, dx.dtype)
-    return [(dx[i], dy[i], radius[i], mask[i]) for i in range(order.shape[0])]
+        seen = [_seen(row, x, frame, functions) for row in zip(*p.obstacles, strict=True)]
+        fields = [list(field) for field in zip(*seen, strict=True)]
+    else:
+        fields = _seen(p.obstacles, x, frame, functions)
+    return nearest(layout.slots, fields, rims, functions)
+
+
+def _seen(row: Any, x: Any, frame: Any, functions: Functions) -> list[Any]:
+    """Centre − position, radius and 1, for one obstacle or for columns of them.
+
+    A fleet's worlds are filled up with obstacles of radius −∞, infinitely far away: four zeros.
+    """
+    dx, dy = row[0] - x[0], row[1] - x[1]
+    radius = functions.positive(row[2]) + 0.0 * dx
+    present = 1.0 * (row[2] > 0.0) + 0.0 * dx
+    if frame is not None:
+        dx, dy = _turned(frame, dx, dy)
+    dx, dy = functions.bounded([present * dx, present * dy], _WIDE)
+    return [dx, dy, radius, present]
 
 
 def _turned(frame: tuple[Any, Any], dx: Any, dy: Any) -> tuple[Any, Any]:

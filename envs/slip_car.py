@@ -207,7 +207,8 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _observe(self) -> np.ndarray:
         t = self._step * self._p.dt
-        seen = layouts.entries(self.layout, self._p, t, self._x, self._rims, FLOATS)
+        seen, _ = layouts.entries(self.layout, self._p, t, self._x, self._rims, FLOATS)
+        seen += [0.0] * (self.layout.size - len(seen))
         return np.array(seen, dtype=np.float32)
 
     def _info(

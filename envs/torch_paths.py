@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from slipcar.envs import observation as layouts
-from slipcar.envs.arrays import tensor_functions
+from slipcar.envs.arrays import Functions, tensor_functions
 from slipcar.envs.car import CONTROL_DIM, STATE_DIM
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
@@ -199,30 +199,25 @@ def observed(
     Raises:
         ValueError: for an unknown kind or a bad number, or a scenario without control bounds.
     """
-    torch = torch_module()
+    torch, functions = torch_module(), tensor_functions()
     layout = layouts.Layout(observation, obstacle_slots)
     scale = scenario.action_scale
 
     def policy(t: float, x: Tensor) -> Tensor:
-        seen = observe(layout, Parameters.like(x[:, 0], scenario), t, x.unbind(dim=-1))
+        p, components = Parameters.like(x[:, 0], scenario), x.unbind(dim=-1)
+        rims = proximity(p, components, functions)[2] if layout.slots else None
+        seen = observe(layout, p, t, components, rims, functions)
         return torch.clamp(network(seen), -1.0, 1.0) * tensor(scale, x.device, x.dtype)
 
     return policy
 
 
-def observe(layout: layouts.Layout, p: Parameters, t: Any, x: Any, rims: Any = None) -> Tensor:
-    """Observations (paths, d) of states' five components, in their dtype.
+def observe(
+    layout: layouts.Layout, p: Parameters, t: Any, x: Any, rims: Any, functions: Functions
+) -> Tensor:
+    """`observation.entries` of tensors (paths,) side by side: (paths, d) in their dtype."""
+    import torch
 
-    Args:
-        layout: which ones.
-        p: for components of this kind.
-        t: time [s], a float or a tensor.
-        x: five tensors (paths,).
-        rims: from `transition.proximity`, where it is known.
-    """
-    torch, functions = torch_module(), tensor_functions()
-    if rims is None and layout.slots:
-        rims = proximity(p, x, functions)[2]
     seen = layouts.entries(layout, p, t, x, rims, functions)
     # Some are the same for all: the time, and what worlds share.
     columns = [e if torch.is_tensor(e) else torch.full_like(x[0], e) for e in seen]

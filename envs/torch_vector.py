@@ -12,7 +12,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from slipcar.envs.arrays import tensor_functions
+from slipcar.envs.arrays import Functions, tensor_functions
 from slipcar.envs.car import CONTROL_DIM
 from slipcar.envs.cost import arrived
 from slipcar.envs.fleet import Source, base_of, longest_horizon, source_of
@@ -33,7 +33,6 @@ from slipcar.envs.transition import goal_cost, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
 
@@ -125,7 +124,7 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
         check_source(self.layout, self.single_observation_space, self._source)
         self.check_actions = self.device.type == "cpu" if check_actions is None else check_actions
         self.compile = bool(compile)
-        advance = functools.partial(_advance, self.layout)
+        advance = functools.partial(_advance, self.layout, tensor_functions())
         self._advance = compiled(advance, self.device) if compile else advance
         self._seed = None if seed is None else checked_int("seed", seed, at_least=0)
         self._generator = torch.Generator(self.device)
@@ -266,14 +265,16 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
         if self.compile:  # a time that is a float would be compiled for each of its values
             self._times = torch.arange(base.nodes, device=self.device, dtype=self.dtype)
         p = worlds.parameters
-        _, distance, rims = proximity(p, x, tensor_functions())
+        functions = tensor_functions()
+        _, distance, rims = proximity(p, x, functions)
         info = {name: self._nothing() for name in ("effort", "obstacle", "goal", "cost")} | {
             "collision": self._all(False),
             "clearance": distance,
             "control": torch.zeros(self.num_envs, CONTROL_DIM, **self._where),
             "is_success": self._all(False),
         }
-        return observe(self.layout, p, self._time(0), x, rims).to(torch.float32), info
+        seen = observe(self.layout, p, self._time(0), x, rims, functions)
+        return seen.to(torch.float32), info
 
     def _checked(self, actions: Any) -> Tensor:
         torch = torch_module()
@@ -320,6 +321,7 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
 
 def _advance(
     layout: Layout,
+    functions: Functions,
     p: Parameters,
     scale: list[float],
     x: Any,
@@ -332,11 +334,11 @@ def _advance(
     import torch
 
     u = [torch.clamp(actions[:, i], -1.0, 1.0) * scale[i] for i in range(CONTROL_DIM)]
-    moved = step(p, x, u, noise, tensor_functions())
+    moved = step(p, x, u, noise, functions)
     return Seen(
         state=moved.state,
         least=torch.minimum(least, moved.distance),
-        observation=observe(layout, p, t, moved.state, moved.rims).to(torch.float32),
+        observation=observe(layout, p, t, moved.state, moved.rims, functions).to(torch.float32),
         reward=-(moved.effort + moved.obstacle),
         effort=moved.effort,
         obstacle=moved.obstacle,

@@ -403,10 +403,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if isinstance(t, np.ndarray):
             t = t.astype(self._dtype, copy=False)
         seen = layouts.entries(self.layout, p, t, self._rounded, rims, ARRAYS)
-        out = np.empty((self.num_envs, self.layout.size), dtype=np.float32)
-        for i, entry in enumerate(seen):
-            out[:, i] = entry
-        return out
+        return layouts.filled(self.layout, (self.num_envs,), *seen)
 
     def _record(self, started: np.ndarray, *, moved: bool) -> None:
         """Keep trails and worlds for pictures, if any are wanted."""
