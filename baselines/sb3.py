@@ -25,12 +25,17 @@ from stable_baselines3.common.vec_env import VecEnv
 from slipcar.envs import SlipCarVectorEnv
 
 
+#: What is summed over an episode, beside the reward.
+_SUMMED = ("effort", "obstacle", "cost")
+
+
 class SB3VecEnv(VecEnv):
     """`SlipCarVectorEnv` as Stable-Baselines3 wants it.
 
     Rewards are float32 and multiplied by `reward_scale`; `info["episode"]["r"]` at an
     episode's end is the unscaled return. At an episode's end `info` also holds the whole
-    episode's `effort` and `obstacle`, its `goal` cost, `collision` and `clearance`.
+    episode's `effort`, `obstacle` and `cost` (nodes inside an obstacle), its `goal` cost,
+    `collision`, `clearance` and `is_success`, which Stable-Baselines3 logs.
 
     Args:
         env: the native environment, with SAME_STEP autoreset.
@@ -51,25 +56,27 @@ class SB3VecEnv(VecEnv):
         self.env = env
         self.reward_scale = float(reward_scale)
         self._actions = np.zeros((env.num_envs, 2), dtype=np.float32)
-        self._totals = np.zeros((3, env.num_envs))  # return, effort, obstacle of the episode
+        self._totals = np.zeros((4, env.num_envs))  # return and `_SUMMED` of the episode
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
         self._began = time.perf_counter()
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.render_mode = env.render_mode
 
     def reset(self) -> np.ndarray:
-        """Start new episodes everywhere, with the seeds given to :meth:`seed` if any.
+        """Start new episodes everywhere, with the seeds and options that were set, if any.
+
+        Options are those of a single environment; a key must be given to all or to none.
 
         Returns:
             Observations, (num_envs, d) float32.
 
         Raises:
-            ValueError: for options: the environment has none.
+            ValueError: for an unknown option, or one that not all are given.
         """
-        if any(self._options):
-            raise ValueError(f"unknown reset options {self._options[0]}; none are known")
         seeds = list(self._seeds) if any(s is not None for s in self._seeds) else None
-        observation, _ = self.env.reset(seed=seeds)
+        observation, _ = self.env.reset(seed=seeds, options=_together(self._options))
         self._reset_seeds()
+        self._reset_options()
         self._totals[:] = 0.0
         self._lengths[:] = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -92,7 +99,7 @@ class SB3VecEnv(VecEnv):
         observation, reward, done, _, info = self.env.step(self._actions)
         # Where an episode ended, `info` tells of the new one and `final_info` of the old.
         last = info.get("final_info")
-        for row, name in zip(self._totals[1:], ("effort", "obstacle"), strict=True):
+        for row, name in zip(self._totals[1:], _SUMMED, strict=True):
             row += info[name] if last is None else np.where(done, last[name], info[name])
         self._totals[0] += reward
         self._lengths += 1
@@ -107,17 +114,17 @@ class SB3VecEnv(VecEnv):
     def _end_of_episode(
         self, i: int, observation: np.ndarray, last: dict[str, np.ndarray]
     ) -> dict[str, Any]:
-        total, effort, obstacle = self._totals[:, i].tolist()
+        total, *sums = self._totals[:, i].tolist()
         seconds = round(time.perf_counter() - self._began, 6)
         return {
             "terminal_observation": observation,
             "TimeLimit.truncated": False,
             "episode": {"r": total, "l": int(self._lengths[i]), "t": seconds},
-            "effort": effort,
-            "obstacle": obstacle,
+            **dict(zip(_SUMMED, sums, strict=True)),
             "goal": float(last["goal"][i]),
             "collision": bool(last["collision"][i]),
             "clearance": float(last["clearance"][i]),
+            "is_success": bool(last["is_success"][i]),
         }
 
     def close(self) -> None:
@@ -166,5 +173,21 @@ class SB3VecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """None each: the vector environment does not render."""
-        return [None] * self.num_envs
+        """One picture (H, W, 3) each where the environment was made to draw them, else None."""
+        if self.env.render_mode != "rgb_array":
+            return [None] * self.num_envs
+        return list(self.env.render() or [])
+
+
+def _together(options: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The options of all sub-environments as those of the native environment."""
+    keys = {key for given in options for key in given}
+    for key in keys:
+        missing = [i for i, given in enumerate(options) if key not in given]
+        if missing:
+            raise ValueError(
+                f"option {key!r} must be given to all sub-environments or to none; {missing[:10]} "
+                "have none"
+            )
+    merged: dict[str, Any] = {key: [given[key] for given in options] for key in keys}
+    return {k: v if k == "scenario" else np.asarray(v) for k, v in merged.items()}

@@ -96,7 +96,7 @@ def compiled(function: Callable[..., Any], device: torch.device) -> Callable[...
             f"torch.compile does not work here for device {str(device)!r} ({reason}): it needs a "
             "C++ compiler for 'cpu' and Triton for 'cuda'; compile=False does without"
         ) from error
-    return torch.compile(function)
+    return torch.compile(function, fullgraph=True)
 
 
 def _probe(x: torch.Tensor) -> torch.Tensor:

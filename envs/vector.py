@@ -23,7 +23,7 @@ from slipcar.envs.noise_store import NoiseStore
 from slipcar.envs.options import check_source, layout_for, read_options
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import RENDER_FPS
-from slipcar.envs.transition import Moved, checked_action, goal_cost, proximity, step
+from slipcar.envs.transition import Moved, goal_cost, limited_action, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
 
 DTYPES = ("float32", "float64")
@@ -285,9 +285,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"sub-environments {resetting.tolist()} are over: reset them "
                 "with options={'reset_mask': ...} before step()"
             )
-        actions = checked_action(actions, (self.num_envs,), self._dtype)
-        limited = np.maximum(actions, -1.0)
-        np.minimum(limited, 1.0, out=limited)
+        limited = limited_action(actions, (self.num_envs,), self._dtype)
         u = np.empty((2, self.num_envs), dtype=self._dtype)
         np.multiply(limited.T, self._worlds.action_scale, out=u)
         if len(resetting):  # NEXT_STEP: this call starts their episodes and ignores the action
@@ -363,7 +361,11 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._noise.common(self._common_step, self._dtype)
 
     def _ended(self, resetting: np.ndarray) -> np.ndarray:
-        over = self._step == self._worlds.steps
+        worlds = self._worlds
+        if self._common_step is None or worlds.shared is None:
+            over = self._step == worlds.steps
+        else:
+            over = np.full(self.num_envs, self._common_step == worlds.shared.nodes - 1)
         if self.terminate_on_collision:
             over |= self._distance < 0.0
         if len(resetting):

@@ -135,6 +135,51 @@ def test_sub_environments_share_attributes():
         ours.env_method("render")
 
 
+def test_episode_ends_say_whether_it_succeeded_and_how_often_it_was_inside():
+    loose = PAPER.replace(goal_tolerance=50.0, obstacles=((0.3, 0.0, 0.2),))
+    ours = adapter(6, loose)
+    ours.seed(0), ours.reset()
+    singles = [SlipCarEnv(loose) for _ in range(6)]
+    for i, env in enumerate(singles):
+        env.reset(seed=i)
+    inside = np.zeros(6)
+    for actions in np.abs(random_actions(40, 6)):
+        infos = ours.step(actions)[3]
+        last = [env.step(a)[4] for env, a in zip(singles, actions, strict=True)]
+        inside += [info["cost"] for info in last]
+    assert [info["is_success"] for info in infos] == [info["is_success"] for info in last]
+    assert [info["cost"] for info in infos] == inside.tolist()
+    assert inside.any()
+
+
+def test_options_reach_the_sub_environments():
+    ours = adapter(3, PAPER)
+    slalom = Scenario.named("slalom")
+    ours.set_options([{"scenario": PAPER}, {"scenario": slalom}, {"scenario": PAPER}])
+    ours.reset()
+    assert ours.env.scenarios == [PAPER, slalom, PAPER]
+    ours.set_options({"start": np.full(5, 0.1)})
+    ours.reset()
+    np.testing.assert_array_equal(ours.env.states, np.full((3, 5), 0.1))
+    ours.set_options([{}, {"scenario": PAPER}, {}])
+    with pytest.raises(ValueError, match=r"'scenario' must be given to all .*\[0, 2\] have none"):
+        ours.reset()
+
+
+def test_families_and_pictures():
+    pytest.importorskip("pygame")
+    env = SlipCarVectorEnv(
+        2, "family:easy", "egocentric", autoreset_mode="SameStep", render_mode="rgb_array"
+    )
+    ours = SB3VecEnv(env)
+    observation = ours.reset()
+    assert observation.shape == (2, 15 + 4 * 2)
+    first, second = ours.get_images()
+    assert first.shape == second.shape
+    assert not np.array_equal(first, second)
+    assert adapter(2).get_images() == [None, None]
+
+
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_other_autoreset_modes_are_refused(mode):
     with pytest.raises(ValueError, match=f"SameStep.*{mode}"):
