@@ -22,7 +22,7 @@ NAMED: dict[str, dict[str, Any]] = {
         "start": (0.0, 0.0, 0.0, 0.0, 0.0),
         "goal": (2.2, 3.0, 0.0, 0.0, 0.0),
     },
-    # Three posts astride the line of travel, to be passed on the right, left and right.
+    # Three posts astride the line of travel, to be passed on either side.
     "slalom": {
         "start": (0.0, 0.0, 0.0, 0.0, 0.0),
         "goal": (6.0, 0.0, 0.0, 0.0, 0.0),
@@ -36,10 +36,10 @@ NAMED: dict[str, dict[str, Any]] = {
         "goal": (3.0, 0.0, 0.0, 0.0, 0.0),
         "obstacles": ((1.5, -0.5, 0.6), (1.5, 1.3, 0.6)),
     },
-    # The same with 0.36 m between them: the clearance rings leave ten centimetres.
+    # 0.36 m between them, of which the clearance rings leave ten centimetres, on a way that bends.
     "narrow-gap": {
-        "start": (0.0, 0.0, 0.0, 0.0, 0.0),
-        "goal": (3.0, 0.0, 0.0, 0.0, 0.0),
+        "start": (0.0, -0.6, 0.0, 0.0, 0.0),
+        "goal": (3.0, 0.6, 0.0, 0.0, 0.0),
         "obstacles": ((1.5, -0.78, 0.6), (1.5, 0.78, 0.6)),
     },
     # From a lane into a bay between two parked cars, at a right angle.
@@ -63,8 +63,8 @@ NAMED: dict[str, dict[str, Any]] = {
         "horizon": 8.0,
         "nodes": 65,
     },
-    # The paper's world on a road five times as slippery.
-    "icy": {"like": "paper", "slip": (0.5, 0.05)},
+    # The paper's world on a road twice as slippery.
+    "icy": {"like": "paper", "slip": (0.2, 0.02)},
     # The paper's world, the start known to 5 cm and 3°, the pose disturbed on the way.
     "uncertain": {
         "like": "paper",
