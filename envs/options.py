@@ -5,9 +5,51 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
 from slipcar.envs.families import Family
 from slipcar.envs.fleet import Source, base_of, longest_horizon, most_obstacles
 from slipcar.envs.observation import Layout
+
+RENDER_MODES = ("rgb_array", "human")
+DTYPES = ("float32", "float64")
+
+
+def check_render_mode(mode: str | None) -> str | None:
+    """The mode itself.
+
+    Raises:
+        ValueError: for an unknown one.
+    """
+    if mode is not None and mode not in RENDER_MODES:
+        raise ValueError(f"unknown render_mode {mode!r}; allowed are None and {list(RENDER_MODES)}")
+    return mode
+
+
+def autoreset_mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    """The mode, or the one of this value.
+
+    Raises:
+        ValueError: for an unknown one.
+    """
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        allowed = [mode.value for mode in AutoresetMode]
+        raise ValueError(f"unknown autoreset_mode {mode!r}; allowed are {allowed}") from None
+
+
+def dtype_of(dtype: Any) -> Any:
+    """NumPy's type of this name.
+
+    Raises:
+        ValueError: for another than float32 and float64.
+    """
+    for name in DTYPES:
+        if dtype == name or dtype == np.dtype(name):
+            return np.dtype(name).type
+    raise ValueError(f"unknown dtype {dtype!r}; allowed are {list(DTYPES)}")
 
 
 def layout_for(source: Source, kind: str, slots: int | None) -> Layout:

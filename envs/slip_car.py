@@ -12,10 +12,17 @@ from gymnasium.spaces import Box
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.arrays import FLOATS
+from slipcar.envs.car import STATE_DIM
 from slipcar.envs.cost import arrived
 from slipcar.envs.episode import draw_episode
 from slipcar.envs.fleet import base_of, longest_horizon, source_of
-from slipcar.envs.options import check_source, layout_for, read_options
+from slipcar.envs.options import (
+    RENDER_MODES,
+    check_render_mode,
+    check_source,
+    layout_for,
+    read_options,
+)
 from slipcar.envs.overlay import Overlay
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
@@ -88,7 +95,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  as gymnasium.Env declares it
-        "render_modes": ["rgb_array", "human"],
+        "render_modes": list(RENDER_MODES),
         "render_fps": RENDER_FPS,
     }
 
@@ -101,16 +108,11 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         terminate_on_collision: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(
-                f"unknown render_mode {render_mode!r}; allowed are None and "
-                f"{self.metadata['render_modes']}"
-            )
         self.source = source_of(scenario)
         self.layout = layout_for(self.source, observation, obstacle_slots)
         self.substeps = checked_int("substeps", substeps, at_least=1)
         self.terminate_on_collision = bool(terminate_on_collision)
-        self.render_mode = render_mode
+        self.render_mode = check_render_mode(render_mode)
         #: What is drawn over the scene beside the trail; see :class:`slipcar.envs.overlay.Overlay`.
         self.overlay: Overlay | None = None
         base = base_of(self.source)
@@ -157,21 +159,20 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         super().reset(seed=seed)
         given, start, noise = read_options(options, ("scenario", "start", "noise"))
-        if given is not None:
-            source = source_of(given)
+        source = self.source if given is None else source_of(given)
+        if source is not self.source:
             check_source(self.layout, self.observation_space, source)
-            self.source = source
-        episode = draw_episode(self.np_random, self.source, self.substeps)
-        self._scenario = scenario = episode.scenario
-        self._p = Parameters.of(scenario)
-        if noise is None:
-            variates = episode.noise
-        else:
-            shape = (scenario.nodes - 1, self.substeps, scenario.noise_dim)
-            variates = checked_array("noise", noise, shape)
-        self._noise = variates.tolist()
-        x = episode.start if start is None else checked_array("start", start, (5,))
-        self._x: list[float] = x.tolist()
+        base = base_of(source)
+        if start is not None:
+            start = checked_array("start", start, (STATE_DIM,))
+        if noise is not None:
+            noise = checked_array("noise", noise, (base.nodes - 1, self.substeps, base.noise_dim))
+        self.source = source
+        episode = draw_episode(self.np_random, source, self.substeps)
+        self._scenario = episode.scenario
+        self._p = Parameters.of(episode.scenario)
+        self._noise = (episode.noise if noise is None else noise).tolist()
+        self._x: list[float] = (episode.start if start is None else start).tolist()
         self._step = 0
         self._over = False
         _, here, self._rims = proximity(self._p, self._x, FLOATS)

@@ -17,18 +17,23 @@ from slipcar.envs.arrays import ARRAYS
 from slipcar.envs.cost import arrived
 from slipcar.envs.episode import read_episodes, words_for_episode
 from slipcar.envs.fleet import Source, Worlds, base_of, longest_horizon, source_of
-from slipcar.envs.gallery import Gallery
 from slipcar.envs.noise import Tapes, seeds_of
 from slipcar.envs.noise_store import NoiseStore
-from slipcar.envs.options import check_source, layout_for, read_options
+from slipcar.envs.options import (
+    RENDER_MODES,
+    autoreset_mode_of,
+    check_render_mode,
+    check_source,
+    dtype_of,
+    layout_for,
+    read_options,
+)
+from slipcar.envs.pictures.gallery import Gallery
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import RENDER_FPS
 from slipcar.envs.transition import Moved, goal_cost, limited_action, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
-
-DTYPES = ("float32", "float64")
-_INFO = ("effort", "obstacle", "goal", "cost", "collision", "clearance", "control", "is_success")
-_MASKS = tuple(f"_{name}" for name in _INFO)
+from slipcar.envs.vector_info import info_at_start, restarted, step_info
 
 
 class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -72,32 +77,18 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         dtype: str = "float32",
         render_mode: str | None = None,
     ) -> None:
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            allowed = [mode.value for mode in AutoresetMode]
-            raise ValueError(
-                f"unknown autoreset_mode {autoreset_mode!r}; allowed are {allowed}"
-            ) from None
+        self.autoreset_mode = autoreset_mode_of(autoreset_mode)
         self.metadata = {
-            "render_modes": ["rgb_array", "human"],
+            "render_modes": list(RENDER_MODES),
             "render_fps": RENDER_FPS,
             "autoreset_mode": self.autoreset_mode,
         }
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(
-                f"unknown render_mode {render_mode!r}; allowed are None and "
-                f"{self.metadata['render_modes']}"
-            )
-        name = np.dtype(dtype).name if dtype in (np.float32, np.float64) else dtype
-        if name not in DTYPES:
-            raise ValueError(f"unknown dtype {dtype!r}; allowed are {list(DTYPES)}")
+        self.render_mode = check_render_mode(render_mode)
+        self._dtype = dtype_of(dtype)
         self.num_envs = checked_int("num_envs", num_envs, at_least=1)
         self.layout = layout_for(source_of(scenario), observation, obstacle_slots)
         self.substeps = checked_int("substeps", substeps, at_least=1)
         self.terminate_on_collision = bool(terminate_on_collision)
-        self.render_mode = render_mode
-        self._dtype: Any = np.dtype(name).type
         self._sources: list[Source] = [source_of(scenario)]
         self._source_of = np.zeros(self.num_envs, dtype=np.int64)
         base = base_of(self._sources[0])
@@ -347,9 +338,10 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _stay(self) -> Moved:
         """All have just been reset."""
-        nothing = np.zeros(self.num_envs, dtype=self._dtype)
         _, distance, rims = self._proximity()
-        return Moved(self._rounded, nothing, nothing, distance, rims)
+        return Moved(
+            self._rounded, np.zeros_like(distance), np.zeros_like(distance), distance, rims
+        )
 
     def _proximity(self) -> tuple[Any, Any, list[Any]]:
         return proximity(self._worlds.parameters, self._rounded, ARRAYS)
@@ -381,20 +373,11 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, ended: np.ndarray, over: np.ndarray, observation: np.ndarray, info: dict[str, Any]
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """SAME_STEP: start the next episodes and hand on how the last ones ended."""
-        final = np.full(self.num_envs, None, dtype=object)
-        for i, last in zip(ended, observation[ended], strict=True):
-            final[i] = last
+        last = observation
         self._start(ended)
         self._record(ended, moved=False)
         _, distance, rims = self._proximity()
-        fresh = self._info_at_start(distance, over)
-        info = {
-            **{k: _choose(over, fresh[k], info[k]) for k in info},
-            "final_obs": final,
-            "_final_obs": over.copy(),
-            "final_info": {k: _masked(over, info[k]) for k in info},
-            "_final_info": over.copy(),
-        }
+        info = restarted(info, self._info_at_start(distance, over), last, over)
         return self._observe(rims), info
 
     # ------------------------------------------------------------------------- what is seen
@@ -449,41 +432,10 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._gallery.close()
 
     def _info_at_start(self, distance: np.ndarray, here: np.ndarray) -> dict[str, Any]:
-        nothing = np.zeros(self.num_envs, dtype=self._dtype)
-        still = Moved(self._rounded, nothing, nothing, distance, [])
-        never = np.zeros(self.num_envs, dtype=bool)
-        return self._info(np.zeros((2, self.num_envs)), still, nothing, never, here)
+        return info_at_start(distance, self._distance, self._step == 0, here)
 
     def _info(
-        self,
-        u: np.ndarray,
-        moved: Moved,
-        goal: np.ndarray,
-        success: np.ndarray,
-        here: np.ndarray | None = None,
+        self, u: np.ndarray, moved: Moved, goal: np.ndarray, success: np.ndarray
     ) -> dict[str, Any]:
-        collision, clearance = self._distance < 0.0, self._distance.copy()
-        inside = moved.distance < 0.0
-        if self._common_step is None or self._common_step == 0:
-            fresh = self._step == 0
-            clearance[fresh], inside[fresh] = moved.distance[fresh], False
-        values = {
-            "effort": moved.effort,
-            "obstacle": moved.obstacle,
-            "goal": goal,
-            "cost": inside.astype(self._dtype),
-            "collision": collision,
-            "clearance": clearance,
-            "control": u.T,
-            "is_success": success,
-        }
-        there = np.ones(self.num_envs, dtype=bool) if here is None else here.copy()
-        return values | dict.fromkeys(_MASKS, there)
-
-
-def _choose(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
-
-
-def _masked(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return _choose(mask, values, np.zeros_like(values))
+        fresh = self._step == 0 if self._common_step is None or self._common_step == 0 else None
+        return step_info(u, moved, goal, success, self._distance, fresh)

@@ -151,7 +151,7 @@ def _check_files(
 def _check_pictures(episodes: int, video: bool) -> None:
     from gymnasium.error import DependencyNotInstalled
 
-    from slipcar.envs.canvas import import_pygame
+    from slipcar.envs.pictures.canvas import import_pygame
     from slipcar.evaluation.film import import_ffmpeg
 
     if episodes > _MOST_FILMED:

@@ -217,7 +217,7 @@ def _in_turn(
 def _tiled(
     recording: Recording, at: np.ndarray, human: bool, fps: int
 ) -> Iterator[np.ndarray | None]:
-    from slipcar.envs.tiles import Tiles
+    from slipcar.envs.pictures.tiles import Tiles
 
     episodes = range(len(recording.states))
     tiles = Tiles([recording.scenario] * len(episodes), human=human, fps=fps)
@@ -247,7 +247,7 @@ def _until(recording: Recording, episode: int, t: float) -> tuple[int, np.ndarra
 
 def _typical(pictures: list[np.ndarray]) -> np.ndarray:
     """A picture with the colours of all; that of a collision, which may come later, included."""
-    from slipcar.envs.sprites import CRASH
+    from slipcar.envs.pictures.sprites import CRASH
 
     chosen = np.unique(np.linspace(0, len(pictures) - 1, 4).round().astype(int))
     some = np.concatenate([pictures[i] for i in chosen])

@@ -129,7 +129,7 @@ def test_bad_families(changes, message):
 def test_what_else_is_refused():
     with pytest.raises(ValueError, match=r"unknown family 'hard'; the named ones are \['random'"):
         SlipCarEnv("family:hard")
-    with pytest.raises(ValueError, match="level must be between 0 and 1, not 1.5"):
+    with pytest.raises(ValueError, match=r"level must be between 0 and 1, not 1\.5"):
         Family().towards(Family(), 1.5)
     with pytest.raises(ValueError, match="count must be between 1 and 100, not 101"):
         Family().held_out(101)

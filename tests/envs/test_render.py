@@ -15,9 +15,9 @@ from slipcar.envs import Scenario, SlipCarEnv
 pygame = pytest.importorskip("pygame")
 
 from slipcar.envs.overlay import RADIUS, Overlay  # noqa: E402
+from slipcar.envs.pictures.sprites import PLAN, speed_colours  # noqa: E402
+from slipcar.envs.pictures.view import CAR_LENGTH, grid_step  # noqa: E402
 from slipcar.envs.render import STRIP, WIDTH, Screen  # noqa: E402
-from slipcar.envs.sprites import PLAN, speed_colours  # noqa: E402
-from slipcar.envs.view import CAR_LENGTH, grid_step  # noqa: E402
 
 PAPER = Scenario.named("paper")
 WORLDS = [Scenario.named(name) for name in Scenario.names()]

@@ -9,11 +9,11 @@ from slipcar.envs import Scenario
 
 pygame = pytest.importorskip("pygame")
 
-from slipcar.envs.gallery import Gallery  # noqa: E402
 from slipcar.envs.overlay import Overlay  # noqa: E402
-from slipcar.envs.scene import Scene  # noqa: E402
-from slipcar.envs.sprites import CRASH  # noqa: E402
-from slipcar.envs.tiles import Tiles  # noqa: E402
+from slipcar.envs.pictures.gallery import Gallery  # noqa: E402
+from slipcar.envs.pictures.scene import Scene  # noqa: E402
+from slipcar.envs.pictures.sprites import CRASH  # noqa: E402
+from slipcar.envs.pictures.tiles import Tiles  # noqa: E402
 
 WORLDS = [Scenario.random(seed, turned=True) for seed in range(5)]
 

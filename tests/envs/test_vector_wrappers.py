@@ -27,7 +27,7 @@ def test_episode_statistics_are_returns_and_lengths(mode):
     envs.reset(seed=0), plain.reset(seed=0)
     total, seen = np.zeros(4), 0
     for a in actions():
-        _, reward, over, _, info = envs.step(a)
+        _, _, over, _, info = envs.step(a)
         total += plain.step(a)[1]
         if over.any():
             np.testing.assert_allclose(info["episode"]["r"], total, rtol=1e-6)
@@ -82,7 +82,7 @@ def test_recorded_video_shows_all_sub_environments(tmp_path):
     reader = pytest.importorskip("imageio_ffmpeg")
     envs = wrappers.RecordVideo(
         make(render_mode="rgb_array", scenario="family:easy"),
-        str(tmp_path),
+        str(tmp_path / "films"),
         episode_trigger=lambda _: True,
         video_length=6,
         disable_logger=True,
@@ -91,7 +91,7 @@ def test_recorded_video_shows_all_sub_environments(tmp_path):
     for a in actions(4, 8):
         envs.step(a)
     envs.close()
-    (film,) = tmp_path.glob("*.mp4")
+    (film,) = (tmp_path / "films").glob("*.mp4")
     frames = reader.read_frames(str(film))
     size = next(frames)["size"]
     assert sum(1 for _ in frames) in (6, 7)  # with or without the first, by version

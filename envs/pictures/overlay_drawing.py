@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.envs import sprites
 from slipcar.envs.overlay import RADIUS, Overlay
-from slipcar.envs.view import View
+from slipcar.envs.pictures import sprites
+from slipcar.envs.pictures.view import View
 
 _ELLIPSES = 8  # drawn with a rim in a whole plan
 _SMALLEST = 1.5  # [px]: an ellipse with less radius is lost under the path

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slipcar.envs import sprites
 from slipcar.envs.overlay import Overlay
-from slipcar.envs.overlay_drawing import draw_overlay
-from slipcar.envs.view import CAR_LENGTH, View, grid_step
+from slipcar.envs.pictures import sprites
+from slipcar.envs.pictures.overlay_drawing import draw_overlay
+from slipcar.envs.pictures.view import CAR_LENGTH, View, grid_step
 
 if TYPE_CHECKING:
     from slipcar.envs.scenario import Scenario

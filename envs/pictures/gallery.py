@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slipcar.envs.tiles import MOST, Tiles
+from slipcar.envs.pictures.tiles import MOST, Tiles
 
 if TYPE_CHECKING:
     from slipcar.envs.scenario import Scenario

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.envs.view import CAR_LENGTH, CAR_WIDTH
+from slipcar.envs.pictures.view import CAR_LENGTH, CAR_WIDTH
 
 PAPER, STRIP_FILL, EDGE = (251, 251, 248), (242, 242, 238), (214, 216, 212)
 INK, FAINT, GRID = (45, 52, 60), (140, 146, 152), (0, 0, 0, 18)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slipcar.envs import sprites
-from slipcar.envs.canvas import Canvas, import_pygame
 from slipcar.envs.overlay import Overlay
-from slipcar.envs.scene import Scene
-from slipcar.envs.view import aspect
+from slipcar.envs.pictures import sprites
+from slipcar.envs.pictures.canvas import Canvas, import_pygame
+from slipcar.envs.pictures.scene import Scene
+from slipcar.envs.pictures.view import aspect
 
 if TYPE_CHECKING:
     from slipcar.envs.scenario import Scenario

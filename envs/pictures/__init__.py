@@ -1,0 +1,1 @@
+"""Drawing with pygame: scenes, tiles, and what moves in them."""
