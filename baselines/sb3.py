@@ -24,7 +24,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from slipcar.envs import SlipCarVectorEnv
 
-
 #: What is summed over an episode, beside the reward.
 _SUMMED = ("effort", "obstacle", "cost")
 

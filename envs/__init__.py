@@ -13,6 +13,8 @@ from slipcar.envs.families import HELD_OUT_SEEDS, Family
 from slipcar.envs.overlay import Overlay
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import SlipCarEnv
+from slipcar.envs.torch_paths import path_costs
+from slipcar.envs.torch_vector import SlipCarTorchEnv
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.vector import SlipCarVectorEnv
 from slipcar.envs.wrappers import SparseSuccess, VectorSparseSuccess
@@ -23,11 +25,13 @@ __all__ = [
     "Overlay",
     "Scenario",
     "SlipCarEnv",
+    "SlipCarTorchEnv",
     "SlipCarVectorEnv",
     "SparseSuccess",
     "Transition",
     "VectorSparseSuccess",
     "control_from_action",
+    "path_costs",
     "transition",
 ]
 

@@ -137,14 +137,14 @@ class Worlds:
     def _keep(self, here: np.ndarray, drawn: Draw) -> None:
         """Remember worlds as they were drawn: the arrays of a step are rounded."""
         most = drawn.obstacles.shape[1]
-        old = self._drawn
-        if old is None or old.obstacles.shape[1] < most:
+        room = old = self._drawn
+        if room is None or room.obstacles.shape[1] < most:
             fields = [np.zeros((self._count, *field.shape[1:]), field.dtype) for field in drawn]
-            self._drawn = Draw(*fields)
+            self._drawn = room = Draw(*fields)
             if old is not None:
-                for new, field in zip(self._drawn, old, strict=True):
+                for new, field in zip(room, old, strict=True):
                     new[tuple(slice(n) for n in field.shape)] = field
-        for kept, field in zip(self._drawn, drawn, strict=True):
+        for kept, field in zip(room, drawn, strict=True):
             kept[(here, *(slice(n) for n in field.shape[1:]))] = field
 
     def noise_columns(self, base: Scenario) -> list[int]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.envs.arrays import FLOATS, Functions, array_namespace
+from slipcar.envs.arrays import FLOATS, Functions
 
 
 def nearest(
@@ -30,9 +30,8 @@ def nearest(
         return [field[i] for i in order for field in fields], None
     if isinstance(rims, np.ndarray):
         return [], _picked(fields, order_of(rims)[:slots])
-    xp = array_namespace(rims)
-    order = xp.argsort(rims, axis=0)[:slots]
-    picked = [xp.take_along_axis(field, order, axis=0) for field in fields]
+    order = _order_of_tensor(rims)[:slots]
+    picked = [field.gather(0, order) for field in fields]  # take_along_dim is 15 times slower
     return [field[i] for i in range(order.shape[0]) for field in picked], None
 
 
@@ -58,8 +57,28 @@ def order_of(rims: np.ndarray) -> np.ndarray:
     return np.stack(rows) & low
 
 
+def _order_of_tensor(rims: Any) -> Any:
+    """:func:`order_of` for Torch, (k, cars) int64: pointwise, so that a compiler can fuse it."""
+    import torch
+
+    count = len(rims)
+    whole = {torch.float32: torch.int32, torch.float64: torch.int64}[rims.dtype]
+    keys = rims.detach().contiguous().view(whole)
+    keys = keys ^ ((keys >> (8 * rims.element_size() - 1)) & torch.iinfo(whole).max)
+    low = (1 << max(count - 1, 1).bit_length()) - 1
+    rows = [(keys[i] & ~low) | i for i in range(count)]
+    for i, j in merge_sort(count):  # no cache: a compiler looks through it, and complains
+        rows[i], rows[j] = torch.minimum(rows[i], rows[j]), torch.maximum(rows[i], rows[j])
+    return (torch.stack(rows) & low).to(torch.int64)
+
+
 @functools.lru_cache(maxsize=64)
 def comparisons(count: int) -> tuple[tuple[int, int], ...]:
+    """:func:`merge_sort`, kept."""
+    return merge_sort(count)
+
+
+def merge_sort(count: int) -> tuple[tuple[int, int], ...]:
     """Batcher's odd-even merge sort of `count` rows: pairs to be put in order, one by one.
 
     Knuth, The Art of Computer Programming 3, 5.2.2, Algorithm M.

@@ -77,7 +77,8 @@ def checked_dtype(dtype: Any) -> torch.dtype:
 def tensor(values: Any, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
     """A copy of an array on a device."""
     torch = torch_module()
-    return torch.from_numpy(np.array(values, dtype=np.float64)).to(device, dtype)
+    # First the dtype: not every device has float64.
+    return torch.from_numpy(np.array(values, dtype=np.float64)).to(dtype).to(device)
 
 
 def compiled(function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:

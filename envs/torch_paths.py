@@ -29,7 +29,7 @@ from slipcar.envs.torch_backend import (
     tensor,
     torch_module,
 )
-from slipcar.envs.transition import Moved, goal_cost, proximity, step
+from slipcar.envs.transition import goal_cost, proximity, step
 from slipcar.envs.validate import checked_int
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def path_costs(
     *,
     compile: bool = False,
 ) -> PathCosts:
-    """Drive many paths and add up what they cost; gradients flow through all but `distance`'s kinks.
+    """Drive many paths and add up what they cost; gradients flow back to what is given.
 
     Device and dtype are the noise's. Controls are limited to the scenario's bounds as in the
     environment, and have no gradient beyond them.
@@ -144,39 +144,22 @@ def path_costs(
         ImportError: if PyTorch is not installed.
     """
     torch = torch_module()
-    steps = scenario.nodes - 1
     _check_noise(scenario, noise)
-    paths, where = noise.shape[3], {"device": noise.device, "dtype": noise.dtype}
-    x = _starts(scenario, start, noise)
-    if not callable(controls):
-        if not torch.is_tensor(controls):
-            raise ValueError(f"controls must be a tensor or a function, not {type(controls)}")
-        if controls.shape != (steps, CONTROL_DIM):
-            raise ValueError(
-                f"controls must have shape {(steps, CONTROL_DIM)}, not {tuple(controls.shape)}"
-            )
-        controls = controls.to(**where)
+    x: Any = _starts(scenario, start, noise)
+    control = _played(scenario, controls, noise)
     limits = None if scenario.control_bounds is None else scenario.control_bounds.tolist()
     p = Parameters.like(x[0], scenario)
     interval = _interval(noise.device if compile else None)
-    effort = obstacle = torch.zeros(paths, **where)
-    distance = torch.full((paths,), torch.inf, **where)
-    for k in range(steps):
-        if callable(controls):
-            u = controls(k * scenario.dt, torch.stack(list(x), dim=-1))
-            if not torch.is_tensor(u) or u.shape != (paths, CONTROL_DIM):
-                given = tuple(u.shape) if torch.is_tensor(u) else type(u)
-                raise ValueError(f"the policy must give controls {(paths, 2)}, not {given}")
-            u = u.to(noise.dtype).unbind(dim=-1)
-        else:
-            u = controls[k].unbind()
+    # The effort of controls that are given is the same for all.
+    effort = noise.new_zeros(noise.shape[3:] if callable(controls) else ())
+    obstacle, distance = torch.zeros_like(x[0]), torch.full_like(x[0], torch.inf)
+    for k in range(scenario.nodes - 1):
+        u = control(k, x)
         if limits is not None:
             u = [torch.clamp(a, -most, most) for a, most in zip(u, limits, strict=True)]
-        moved = interval(p, x, u, noise[k])
-        x = moved.state
-        effort, obstacle = effort + moved.effort, obstacle + moved.obstacle
-        distance = torch.minimum(distance, moved.distance)
+        x, effort, obstacle, distance = interval(p, x, u, noise[k], effort, obstacle, distance)
     goal = goal_cost(p, x)
+    effort = effort.expand_as(goal).contiguous()
     total = effort + obstacle + goal
     return PathCosts(effort, obstacle, goal, total, distance, torch.stack(list(x), dim=-1))
 
@@ -201,13 +184,18 @@ def observed(
     """
     torch, functions = torch_module(), tensor_functions()
     layout = layouts.Layout(observation, obstacle_slots)
-    scale = scenario.action_scale
+    scenario.action_scale  # noqa: B018  raises if unbounded
+
+    @functools.cache  # to copy them to a device at every step would make it wait
+    def numbers(device: Any, dtype: Any) -> tuple[Parameters, Tensor]:
+        like = torch.empty(1, device=device, dtype=dtype)
+        return Parameters.like(like, scenario), tensor(scenario.action_scale, device, dtype)
 
     def policy(t: float, x: Tensor) -> Tensor:
-        p, components = Parameters.like(x[:, 0], scenario), x.unbind(dim=-1)
+        (p, scale), components = numbers(x.device, x.dtype), x.unbind(dim=-1)
         rims = proximity(p, components, functions)[2] if layout.slots else None
         seen = observe(layout, p, t, components, rims, functions)
-        return torch.clamp(network(seen), -1.0, 1.0) * tensor(scale, x.device, x.dtype)
+        return torch.clamp(network(seen), -1.0, 1.0) * scale
 
     return policy
 
@@ -218,17 +206,61 @@ def observe(
     """`observation.entries` of tensors (paths,) side by side: (paths, d) in their dtype."""
     import torch
 
-    seen = layouts.entries(layout, p, t, x, rims, functions)
+    seen, _ = layouts.entries(layout, p, t, x, rims, functions)
+    seen += [0.0] * (layout.size - len(seen))
     # Some are the same for all: the time, and what worlds share.
     columns = [e if torch.is_tensor(e) else torch.full_like(x[0], e) for e in seen]
     return torch.stack([column.expand_as(x[0]) for column in columns], dim=-1)
 
 
 @functools.cache
-def _interval(device: torch.device | None = None) -> Callable[..., Moved]:
-    """`transition.step` for tensors, compiled if a device is given."""
-    interval = functools.partial(step, functions=tensor_functions())
+def _interval(device: torch.device | None = None) -> Callable[..., Any]:
+    """:func:`_driven` for tensors, compiled if a device is given."""
+    interval = functools.partial(_driven, tensor_functions())
     return interval if device is None else compiled(interval, device)
+
+
+def _driven(
+    functions: Functions,
+    p: Parameters,
+    x: Any,
+    u: Any,
+    noise: Tensor,
+    effort: Tensor,
+    obstacle: Tensor,
+    distance: Tensor,
+) -> tuple[Any, Tensor, Tensor, Tensor]:
+    """One interval further: the states' components, the costs so far, the smallest distance."""
+    import torch
+
+    moved = step(p, x, u, noise, functions)
+    nearest = torch.minimum(distance, moved.distance)
+    return moved.state, effort + moved.effort, obstacle + moved.obstacle, nearest
+
+
+def _played(
+    scenario: Scenario, controls: Tensor | Policy, noise: Tensor
+) -> Callable[[int, Any], Any]:
+    """The two components of the controls, from the step and the states' five."""
+    torch = torch_module()
+    if callable(controls):
+        policy, wanted = controls, (noise.shape[3], CONTROL_DIM)
+
+        def decided(k: int, x: Any) -> Any:
+            u = policy(k * scenario.dt, torch.stack(list(x), dim=-1))
+            if not torch.is_tensor(u) or u.shape != wanted:
+                given = tuple(u.shape) if torch.is_tensor(u) else type(u)
+                raise ValueError(f"the policy must give controls {wanted}, not {given}")
+            return u.to(noise.dtype).unbind(dim=-1)
+
+        return decided
+    if not torch.is_tensor(controls):
+        raise ValueError(f"controls must be a tensor or a function, not {type(controls)}")
+    shape = (scenario.nodes - 1, CONTROL_DIM)
+    if controls.shape != shape:
+        raise ValueError(f"controls must have shape {shape}, not {tuple(controls.shape)}")
+    rows = controls.to(noise.device, noise.dtype)
+    return lambda k, _: rows[k].unbind()
 
 
 def _normals(shape: Any, seed: Any, device: torch.device, dtype: torch.dtype) -> Tensor:

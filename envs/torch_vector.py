@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 from slipcar.envs.arrays import Functions, tensor_functions
 from slipcar.envs.car import CONTROL_DIM
 from slipcar.envs.cost import arrived
+from slipcar.envs.families import Family
 from slipcar.envs.fleet import Source, base_of, longest_horizon, source_of
 from slipcar.envs.observation import Layout
 from slipcar.envs.options import check_source, layout_for, read_options
@@ -69,7 +70,8 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
     generator: their paths depend on the seed, on `num_envs`, and on the kind of device.
 
     With a family the worlds come from a pool, drawn at every `reset`; each episode puts every car
-    into one of the pool's by chance (:mod:`slipcar.envs.torch_worlds`).
+    into one of the pool's by chance (:mod:`slipcar.envs.torch_worlds`). Episodes do not end at a
+    collision; `info["collision"]` tells of it.
 
     Args:
         num_envs: how many, at least 1.
@@ -129,7 +131,12 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
         self._seed = None if seed is None else checked_int("seed", seed, at_least=0)
         self._generator = torch.Generator(self.device)
         self._worlds: TensorWorlds | None = None
+        #: Of the episode that runs: given variates, states (5 tensors), smallest distance, step.
         self._noise: Tensor | None = None
+        self._x: Any = []
+        self._least: Any = None
+        self._step = 0
+        self._scale: list[float] = []
 
     @property
     def scenario(self) -> Scenario:
@@ -155,7 +162,7 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
         self._ready()
         return torch_module().stack(list(self._x), dim=-1)
 
-    def reset(  # type: ignore[override]  # tensors for arrays
+    def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start an episode in every car.
@@ -186,16 +193,14 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
         if seed is not None or self._worlds is None:
             self._np_random, self._np_random_seed = seeding.np_random(seed)
             self._generator.manual_seed(int(self._np_random.integers(2**63)))
-        if self._worlds is None or source is not self._source or source is not base_of(source):
+        if self._worlds is None or source is not self._source or isinstance(source, Family):
             self._source = source
             self._worlds = TensorWorlds(
-                source, self.num_envs, self._pool, self._np_random, self.device, self.dtype
+                source, self.num_envs, self._pool, self.np_random, self.device, self.dtype
             )
         return self._start(noise)
 
-    def step(  # type: ignore[override]  # tensors for arrays
-        self, actions: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """One control interval of every car.
 
         Args:
@@ -243,7 +248,8 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
             if over:
                 last = {"final_obs": observation, "final_info": info}
                 observation, info = self._start(None)
-                info = {**info, **last, "_final_obs": self._all(True)}
+                masks = {"_final_obs": self._all(True), "_final_info": self._all(True)}
+                info = {**info, **last, **masks}
             return observation, reward, self._all(over), self._all(False), info
 
     def _ready(self) -> TensorWorlds:
@@ -278,7 +284,10 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
 
     def _checked(self, actions: Any) -> Tensor:
         torch = torch_module()
-        actions = torch.as_tensor(actions).detach().to(**self._where)
+        try:
+            actions = torch.as_tensor(actions).detach().to(**self._where)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"action must be an array of numbers, not {actions!r}") from error
         if actions.shape != (self.num_envs, CONTROL_DIM):
             wanted = (self.num_envs, CONTROL_DIM)
             raise ValueError(f"action must have shape {wanted}, not {tuple(actions.shape)}")

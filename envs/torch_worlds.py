@@ -86,7 +86,7 @@ class TensorWorlds:
         if self._pool is None or self.which is None:
             return [base] * self._cars
         rows, inverse = np.unique(self.which.cpu().numpy(), return_inverse=True)
-        worlds = [self._pool.scenario(int(row), base) for row in rows]
+        worlds = [self._pool.scenario(int(row), self.source) for row in rows]
         return [worlds[i] for i in inverse]
 
 
