@@ -41,7 +41,7 @@ class Episodes(NamedTuple):
         drawn: the worlds, or None where the source is one scenario.
         deviations: standard normal variates of the start, (rows, 5), or None where it is certain.
         noise: standard normal variates of the first and of the second half of the steps,
-            (2, rows, ⌈(N − 1)/2⌉, substeps, 3 + p) float32; see :func:`halves`.
+            (2, ⌈(N − 1)/2⌉, substeps, 3 + p, rows) float32; see :func:`halves`.
     """
 
     drawn: Draw | None
@@ -78,12 +78,12 @@ def read_episodes(
         drawn, words = source.draw(words[:, : source.words]), words[:, source.words :]
     if base.start_deviation.any():
         pairs = noise.normals(words[:, :_START_WORDS])
-        deviations = np.concatenate(list(pairs), axis=1)[:, :STATE_DIM]
+        deviations = np.concatenate(list(pairs))[:STATE_DIM].T
         words = words[:, _START_WORDS:]
-    shape = (2, rows, halves(base.nodes - 1), substeps, base.noise_dim)
+    shape = (2, halves(base.nodes - 1), substeps, base.noise_dim, rows)
     if out is None:
         out = np.empty(shape, dtype=np.float32)
-    noise.normals(words, out.reshape(2, rows, -1))
+    noise.normals(words, out.reshape(2, -1, rows))
     return Episodes(drawn, deviations, out)
 
 
@@ -99,4 +99,4 @@ def draw_episode(rng: np.random.Generator, source: Source, substeps: int) -> Epi
     if deviations is not None:
         start = start + scenario.start_deviation * deviations[0]
     steps = scenario.nodes - 1
-    return Episode(scenario, start, np.concatenate(variates[:, 0])[:steps])
+    return Episode(scenario, start, np.concatenate(list(variates[..., 0]))[:steps])

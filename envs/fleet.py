@@ -76,12 +76,32 @@ class Worlds:
     def share(self, scenario: Scenario) -> None:
         """Put all cars into one scenario."""
         self.shared: Scenario | None = scenario
+        self._parts: dict[tuple[int, int], Parameters] = {}
         self.parameters = Parameters.like(np.empty(self._count, dtype=self._dtype), scenario)
         self.steps = np.full(self._count, scenario.nodes - 1)
         self.start = np.repeat(scenario.start[:, None], self._count, axis=1)
         self.start_deviation = scenario.start_deviation[:, None]
         self.tolerance = scenario.goal_tolerance[:, None]
         self.action_scale: np.ndarray = scenario.action_scale[:, None].astype(self._dtype)
+
+    def part(self, here: slice) -> Parameters:
+        """The numbers of a step for some cars side by side."""
+        if self.shared is not None:
+            return self.parameters
+        key = (here.start, here.stop)
+        if key not in self._parts:
+            p = self.parameters
+            self._parts[key] = Parameters(
+                dt=p.dt[here],
+                horizon=p.horizon[here],
+                slip=[s[here] for s in p.slip],
+                process=tuple((i, deviation[here]) for i, deviation in p.process),
+                obstacles=tuple(column[:, here] for column in p.obstacles),
+                obstacle_weight=p.obstacle_weight[here],
+                goal=[g[here] for g in p.goal],
+                goal_weight=[w[here] for w in p.goal_weight],
+            )
+        return self._parts[key]
 
     def put(self, here: np.ndarray, source: Source, drawn: Draw | None) -> None:
         """Put the cars `here` (indices) into a scenario, or into worlds drawn from a family."""
@@ -145,7 +165,8 @@ class Worlds:
                 for new, field in zip(room, old, strict=True):
                     new[tuple(slice(n) for n in field.shape)] = field
         for kept, field in zip(room, drawn, strict=True):
-            kept[(here, *(slice(n) for n in field.shape[1:]))] = field
+            corner: Any = (here, *(slice(n) for n in field.shape[1:]))
+            kept[corner] = field
 
     def noise_columns(self, base: Scenario) -> list[int]:
         """Where the variates of a scenario's noise belong among those of the fleet's."""
@@ -176,6 +197,7 @@ class Worlds:
                 setattr(self, name, np.repeat(getattr(self, name), count, axis=1))
             self.shared = None
         p = self.parameters
+        self._parts = {}
         missing = max(0, obstacles - len(p.obstacles[0]))
         absent: list[np.ndarray] = [
             np.full((missing, count), value, dtype=dtype) for value in _ABSENT

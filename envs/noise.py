@@ -41,32 +41,30 @@ def normals(words: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
 
     Args:
         words: (rows, w) uint64; the two halves of each are a and b.
-        out: (2, rows, w) float32, contiguous.
+        out: (2, w, rows) float32, contiguous.
 
     Returns:
-        `out`: the cosines, then the sines.
+        `out`: the cosines, then the sines; side by side those of one column of words, because
+        that is what a step of many cars needs.
     """
     rows, width = words.shape
     if out is None:
-        out = np.empty((2, rows, width), dtype=np.float32)
+        out = np.empty((2, width, rows), dtype=np.float32)
     together = max(1, _TOGETHER // max(1, width))
     for first in range(0, rows, together):
         here = slice(first, first + together)
-        halves = np.ascontiguousarray(words[here]).reshape(-1).view(np.uint32)
-        radius = halves[0::2].astype(np.float32)
+        halves = np.ascontiguousarray(words[here].T).view(np.uint32)
+        radius = halves[:, 0::2].astype(np.float32)
         # (i + ½) 2⁻³²: never 0, and near it a float32 is precise; 1 at the other end is allowed.
         radius += np.float32(0.5)
         radius *= np.float32(2.0**-32)
         np.log(radius, out=radius)
         radius *= np.float32(-2.0)
         np.sqrt(radius, out=radius)
-        angle = halves[1::2].astype(np.float32)
+        angle = halves[:, 1::2].astype(np.float32)
         angle *= np.float32(math.tau * 2.0**-32)
-        cosines, sines = (block[here].reshape(-1) for block in out)
-        np.cos(angle, out=cosines)
-        cosines *= radius
-        np.sin(angle, out=sines)
-        sines *= radius
+        np.multiply(radius, np.cos(angle), out=out[0, :, here])
+        np.multiply(radius, np.sin(angle, out=angle), out=out[1, :, here])
     return out
 
 

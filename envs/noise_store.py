@@ -14,7 +14,7 @@ class NoiseStore:
     """Standard normal variates of episodes, in halves (:func:`slipcar.envs.episode.halves`).
 
     Attributes:
-        array: (2, count, half, substeps, columns) float32.
+        array: (2, half, substeps, columns, count) float32.
 
     Args:
         count: how many episodes run side by side.
@@ -32,11 +32,16 @@ class NoiseStore:
     @property
     def half(self) -> int:
         """Steps in either half."""
-        return self.array.shape[2]
+        return self.array.shape[1]
+
+    @property
+    def columns(self) -> int:
+        """Brownian motions."""
+        return self.array.shape[3]
 
     def fit(self, steps: int, columns: int) -> None:
         """Room for episodes of just so many steps and motions; what was there is lost."""
-        shape = (2, self._count, halves(steps), self._substeps, columns)
+        shape = (2, halves(steps), self._substeps, columns, self._count)
         if self.array.shape != shape:
             self.array = np.zeros(shape, dtype=np.float32)
 
@@ -45,15 +50,15 @@ class NoiseStore:
 
         Args:
             here: which episodes, indices.
-            noise: in halves, (2, len(here), half, substeps, c).
+            noise: in halves, (2, half, substeps, c, len(here)).
             where: to which columns its own belong, c of them.
             columns: how many there are in all.
         """
-        half = max(self.half, noise.shape[2])
-        if (half, columns) != (self.half, self.array.shape[4]):
+        half = max(self.half, noise.shape[1])
+        if (half, columns) != (self.half, self.columns):
             old = self._whole(self.array)
             self.fit(2 * half, columns)
-            self._give(self._everyone, old, list(range(old.shape[3])))
+            self._give(self._everyone, old, list(range(old.shape[2])))
         self._give(here, self._whole(noise), where)
 
     def give(self, here: np.ndarray, noise: Any, steps: int) -> None:
@@ -67,33 +72,27 @@ class NoiseStore:
         Raises:
             ValueError: for another shape or a non-finite entry.
         """
-        shape = (self._count, steps, self._substeps, self.array.shape[4])
+        shape = (self._count, steps, self._substeps, self.columns)
         given = checked_array("noise", noise, shape)
-        self._give(here, given[here], list(range(shape[3])))
+        self._give(here, np.moveaxis(given[here], 0, -1), list(range(self.columns)))
 
-    def common(self, k: int, dtype: Any) -> np.ndarray:
+    def common(self, k: int) -> np.ndarray:
         """Variates of step k of all, indexed [substep, column, episode]."""
         half, k = divmod(k, self.half)
-        return np.ascontiguousarray(self.array[half, :, k].transpose(1, 2, 0), dtype=dtype)
+        return self.array[half, k]
 
-    def each(self, steps: np.ndarray, dtype: Any) -> np.ndarray:
+    def each(self, steps: np.ndarray) -> np.ndarray:
         """Variates of step `steps[i]` of episode i, indexed [substep, column, episode]."""
         half, k = np.divmod(np.minimum(steps, 2 * self.half - 1), self.half)
-        now = self.array[half, self._everyone, k]
-        return np.ascontiguousarray(now.transpose(1, 2, 0), dtype=dtype)
+        return np.moveaxis(self.array[half, k, :, :, self._everyone], 0, -1)
 
     @staticmethod
     def _whole(noise: np.ndarray) -> np.ndarray:
-        return np.concatenate(list(noise), axis=1)
+        return np.concatenate(list(noise))
 
     def _give(self, here: np.ndarray, noise: np.ndarray, where: list[int]) -> None:
-        """Noise (len(here), steps, substeps, c), one step after the other."""
-        half = self.half
-        for first in (0, half):
-            part = noise[:, first : first + half]
-            block = self.array[first // half]
-            if where == list(range(block.shape[3])):
-                block[here, : part.shape[1]] = part
-            else:
-                for column, source in zip(where, np.moveaxis(part, 3, 0), strict=True):
-                    block[here, : part.shape[1], :, column] = source
+        """Noise (steps, substeps, c, len(here)), each half for itself."""
+        for block, first in zip(self.array, (0, self.half), strict=True):
+            part = noise[first : first + self.half]
+            for column, source in zip(where, np.moveaxis(part, 2, 0), strict=True):
+                block[: len(part), :, column][..., here] = source

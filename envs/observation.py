@@ -214,24 +214,21 @@ def observe(
     functions = functions_of(components[0])
     rims = proximity(p, components, functions)[2] if slots else []
     seen = entries(layout, p, np.asarray(t, dtype=np.float64), components, rims, functions)
-    out = filled(layout, states.shape[:-1], *seen)
+    out = np.empty((*states.shape[:-1], layout.size), dtype=np.float32)
+    fill(out, *seen)
     return out.reshape(*x.shape[:-1], layout.size)
 
 
-def filled(
-    layout: Layout, shape: tuple[int, ...], seen: list[Any], block: np.ndarray | None
-) -> np.ndarray:
-    """Observations (*shape, size) float32 from what :func:`entries` gave."""
-    out = np.empty((*shape, layout.size), dtype=np.float32)
+def fill(out: np.ndarray, seen: list[Any], block: np.ndarray | None) -> None:
+    """Write what :func:`entries` gave into observations `out` (..., size)."""
     for i, entry in enumerate(seen):
         out[..., i] = entry
     told = len(seen)
     if block is not None:
         out[..., told : told + block.shape[-1]] = block
         told += block.shape[-1]
-    if told < layout.size:
+    if told < out.shape[-1]:
         out[..., told:] = 0.0
-    return out
 
 
 def observation_space(scenario: Scenario, kind: str, slots: int = 0) -> Box:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,12 +30,16 @@ from slipcar.envs.options import (
     layout_for,
     read_options,
 )
+from slipcar.envs.parameters import Parameters
 from slipcar.envs.pictures.gallery import Gallery
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import RENDER_FPS
 from slipcar.envs.transition import Moved, goal_cost, limited_action, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
 from slipcar.envs.vector_info import info_at_start, restarted, step_info
+
+#: Cars whose step is computed at a time.
+_TOGETHER = 4096
 
 
 class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -101,6 +107,8 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._worlds = Worlds(self.num_envs, self._dtype, base)
         self._ready = False
         self._everyone = np.arange(self.num_envs)
+        #: What is computed at a time, small enough for the cache.
+        self._parts = _parts(self.num_envs)
         self._noise = NoiseStore(self.num_envs, base.nodes - 1, self.substeps, base.noise_dim)
         #: States, (5, num_envs), and the same as increments and observations take them.
         self._x = self._worlds.start.copy()
@@ -182,11 +190,11 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._put_at(here, starts[here].T)
         if noise is not None:
             self._noise.give(here, noise, int(self._worlds.steps.max()))
-        _, distance, rims = self._proximity()
+        distance, observation = self._look()
         started = np.zeros(self.num_envs, dtype=bool)
         started[here] = True
         self._record(here, moved=False)
-        return self._observe(rims), self._info_at_start(distance, started)
+        return observation, self._info_at_start(distance, started)
 
     def _masked(self, mask: Any) -> np.ndarray:
         if mask is None:
@@ -282,10 +290,15 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if len(resetting):  # NEXT_STEP: this call starts their episodes and ignores the action
             self._start(resetting)
         if len(resetting) == self.num_envs:
-            moved = self._stay()
+            moved, observation = self._stay()
             u[:] = 0.0
         else:
-            moved = self._move(u, resetting)
+            begun = self._x[:, resetting]
+            moved, observation = self._move(u)
+            if len(resetting):
+                moved, observation = self._undone(resetting, begun, moved, u)
+            else:
+                np.minimum(self._distance, moved.distance, out=self._distance)
         over = self._ended(resetting)
         goal = np.zeros(self.num_envs)
         success = np.zeros(self.num_envs, dtype=bool)
@@ -300,57 +313,71 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if len(ended):
             reward += goal
         np.negative(reward, out=reward)
-        observation = self._observe(moved.rims)
         self._record(resetting, moved=True)
         if len(ended) and self.autoreset_mode is AutoresetMode.SAME_STEP:
             observation, info = self._restart(ended, over, observation, info)
         return observation, reward, over, self._no_truncation.copy(), info
 
-    def _move(self, u: np.ndarray, resetting: np.ndarray) -> Moved:
-        """Step all but those that have just been reset."""
-        before = self._x[:, resetting]
-        moved = step(
-            self._worlds.parameters, self._rounded, u, self._noise_now(), ARRAYS, self._add
-        )
+    def _move(self, u: np.ndarray) -> tuple[Moved, np.ndarray]:
+        """One step of all, and what they see then."""
+        noise, observation = self._noise_now(), self._blank()
+        effort, obstacle, distance = np.empty((3, self.num_envs), dtype=self._dtype)
         self._step += 1
         if self._common_step is not None:
             self._common_step += 1
-        if len(resetting):
-            self._x[:, resetting] = self._rounded[:, resetting] = before
-            self._step[resetting] = 0
-            self._common_step = None
-            u[:, resetting] = 0.0
-            moved.effort[resetting] = moved.obstacle[resetting] = 0.0
-            _, distance, rims = self._proximity()
-            moved = moved._replace(distance=distance, rims=rims)
-            far = moved.distance.copy()
-            far[resetting] = np.inf
-            np.minimum(self._distance, far, out=self._distance)
-        else:
-            np.minimum(self._distance, moved.distance, out=self._distance)
-        return moved
+        for here in self._parts:
+            p = self._worlds.part(here)
+            add = functools.partial(self._add, here)
+            moved = step(p, self._rounded[:, here], u[:, here], noise[..., here], ARRAYS, add)
+            effort[here], obstacle[here] = moved.effort, moved.obstacle
+            distance[here] = moved.distance
+            self._observe(p, here, moved.rims, observation)
+        return Moved(None, effort, obstacle, distance, None), observation
 
-    def _add(self, x: Any, added: list[np.ndarray]) -> np.ndarray:
+    def _add(self, here: slice, x: Any, added: list[np.ndarray]) -> np.ndarray:
+        """Add to the states, and give them as increments take them."""
         for row, change in zip(self._x, added, strict=True):
-            row += change
-        self._rounded = self._x.astype(self._dtype)
-        return self._rounded
+            row[here] += change
+        rounded = self._rounded[:, here]
+        rounded[:] = self._x[:, here]
+        return rounded
 
-    def _stay(self) -> Moved:
+    def _undone(
+        self, resetting: np.ndarray, begun: np.ndarray, moved: Moved, u: np.ndarray
+    ) -> tuple[Moved, np.ndarray]:
+        """Those that have just been reset have not moved."""
+        self._put_at(resetting, begun)
+        self._step[resetting] = 0
+        self._common_step = None
+        u[:, resetting] = 0.0
+        moved.effort[resetting] = moved.obstacle[resetting] = 0.0
+        now, observation = self._look()
+        moved.distance[resetting] = np.inf
+        np.minimum(self._distance, moved.distance, out=self._distance)
+        return moved._replace(distance=now), observation
+
+    def _stay(self) -> tuple[Moved, np.ndarray]:
         """All have just been reset."""
-        _, distance, rims = self._proximity()
-        return Moved(
-            self._rounded, np.zeros_like(distance), np.zeros_like(distance), distance, rims
-        )
+        distance, observation = self._look()
+        nothing = np.zeros((2, self.num_envs), dtype=self._dtype)
+        return Moved(None, nothing[0], nothing[1], distance, None), observation
 
-    def _proximity(self) -> tuple[Any, Any, list[Any]]:
-        return proximity(self._worlds.parameters, self._rounded, ARRAYS)
+    def _look(self) -> tuple[np.ndarray, np.ndarray]:
+        """Distance to the nearest rim (num_envs,), and observations, where the cars are."""
+        distance, observation = np.empty(self.num_envs, dtype=self._dtype), self._blank()
+        for here in self._parts:
+            p = self._worlds.part(here)
+            _, distance[here], rims = proximity(p, self._rounded[:, here], ARRAYS)
+            self._observe(p, here, rims, observation)
+        return distance, observation
 
     def _noise_now(self) -> np.ndarray:
         """Variates of this step, indexed [substep, column, car]."""
         if self._common_step is None:
-            return self._noise.each(self._step, self._dtype)
-        return self._noise.common(self._common_step, self._dtype)
+            now = self._noise.each(self._step)
+        else:
+            now = self._noise.common(self._common_step)
+        return now.astype(self._dtype, copy=False)
 
     def _ended(self, resetting: np.ndarray) -> np.ndarray:
         worlds = self._worlds
@@ -373,22 +400,23 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, ended: np.ndarray, over: np.ndarray, observation: np.ndarray, info: dict[str, Any]
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """SAME_STEP: start the next episodes and hand on how the last ones ended."""
-        last = observation
         self._start(ended)
         self._record(ended, moved=False)
-        _, distance, rims = self._proximity()
-        info = restarted(info, self._info_at_start(distance, over), last, over)
-        return self._observe(rims), info
+        distance, fresh = self._look()
+        return fresh, restarted(info, self._info_at_start(distance, over), observation, over)
 
     # ------------------------------------------------------------------------- what is seen
 
-    def _observe(self, rims: Any) -> np.ndarray:
-        p, k = self._worlds.parameters, self._common_step
-        t = p.dt * (self._step if k is None else k)
+    def _blank(self) -> np.ndarray:
+        return np.empty((self.num_envs, self.layout.size), dtype=np.float32)
+
+    def _observe(self, p: Parameters, here: slice, rims: Any, out: np.ndarray) -> None:
+        k = self._common_step
+        t = p.dt * (self._step[here] if k is None else k)
         if isinstance(t, np.ndarray):
             t = t.astype(self._dtype, copy=False)
-        seen = layouts.entries(self.layout, p, t, self._rounded, rims, ARRAYS)
-        return layouts.filled(self.layout, (self.num_envs,), *seen)
+        seen = layouts.entries(self.layout, p, t, self._rounded[:, here], rims, ARRAYS)
+        layouts.fill(out[here], *seen)
 
     def _record(self, started: np.ndarray, *, moved: bool) -> None:
         """Keep trails and worlds for pictures, if any are wanted."""
@@ -439,3 +467,10 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> dict[str, Any]:
         fresh = self._step == 0 if self._common_step is None or self._common_step == 0 else None
         return step_info(u, moved, goal, success, self._distance, fresh)
+
+
+def _parts(count: int) -> list[slice]:
+    """Slices of almost equal length, of at most `_TOGETHER`."""
+    pieces = -(-count // _TOGETHER)
+    ends = np.linspace(0, count, pieces + 1).round().astype(int).tolist()
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
