@@ -25,6 +25,13 @@ once in an installation, is in the table of cold starts). A time of CasADi's is 
 solver. Whatever a contender believes of its answer, its controls are driven through
 slipcar's own dynamics, and the cost and the miss of the goal are those of that path. Milliseconds
 belong to the machine; what carries over are ratios within a run."""
+_HOW_ENVIRONMENT = """\
+One process, pinned to one core where the system allows it (`OMP_NUM_THREADS=1`). What is compared
+is stepped by turns, in an order drawn anew each round, so that a busy machine is busy for all; a
+first turn is not counted. Steps per second belong to the machine; what carries over are ratios
+within a run."""
+#: By page; `_HOW` elsewhere.
+_HOW_OF = {"benchmarks-environment.md": _HOW_ENVIRONMENT}
 
 
 def write(
@@ -69,7 +76,7 @@ def write(
         "",
         f"## {how}",
         "",
-        _HOW,
+        _HOW_OF.get(name, _HOW),
         "",
         *(report.markdown(section, told, _PREFIX) for section, told in sections),
     ]

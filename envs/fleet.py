@@ -11,14 +11,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from slipcar.envs.families import Draw, Family
-from slipcar.envs.parameters import Parameters
+from slipcar.envs.parameters import ABSENT, Parameters, obstacle_columns
 from slipcar.envs.scenario import Scenario
 
 #: What an environment draws its episodes' worlds from.
 Source: TypeAlias = Scenario | Family
-
-#: An obstacle that is not there: x, y, radius and reach of one infinitely far away.
-_ABSENT = (1e9, 1e9, -np.inf, 0.0)
 
 
 def source_of(value: Any) -> Source:
@@ -132,11 +129,9 @@ class Worlds:
         obstacles = base.obstacles[None] if drawn is None else drawn.obstacles
         count = np.array([len(base.obstacles)]) if drawn is None else drawn.counts
         k = obstacles.shape[1]
-        x, y, radius = np.moveaxis(obstacles, -1, 0)
+        columns = obstacle_columns(obstacles, base.clearance)
         there = np.arange(k) < count[:, None]
-        for column, value, absent in zip(
-            p.obstacles, (x, y, radius, radius + base.clearance), _ABSENT, strict=True
-        ):
+        for column, value, absent in zip(p.obstacles, columns, ABSENT, strict=True):
             column[:k, here] = np.where(there, value, absent).T
             column[k:, here] = absent
 
@@ -200,7 +195,7 @@ class Worlds:
         self._parts = {}
         missing = max(0, obstacles - len(p.obstacles[0]))
         absent: list[np.ndarray] = [
-            np.full((missing, count), value, dtype=dtype) for value in _ABSENT
+            np.full((missing, count), value, dtype=dtype) for value in ABSENT
         ]
         known = dict(p.process)
         reached = {i: known.get(i, array(0.0)) for i in sorted(process | set(known))}

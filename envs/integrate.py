@@ -48,10 +48,10 @@ def increments(
         functions: for this kind of component.
     """
     theta, v, omega = x[2], x[3], x[4]
-    b = car.rates(v, omega, functions.cos(theta), functions.sin(theta), u[0], u[1])
-    position, heading = car.slip_rates(v, omega, slip[0], slip[1])
-    position, heading = root_dt * position, root_dt * heading
-    added = [dt * rate for rate in b]
+    # Both are linear in what is scaled here, so that h and √h cost next to nothing.
+    cos, sin = functions.cos(theta), functions.sin(theta)
+    added = list(car.rates(dt * v, dt * omega, cos, sin, dt * u[0], dt * u[1]))
+    position, heading = car.slip_rates(v, omega, root_dt * slip[0], root_dt * slip[1])
     added[0] = added[0] + position * noise[0]
     added[1] = added[1] + position * noise[1]
     added[2] = added[2] + heading * noise[2]

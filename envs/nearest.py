@@ -17,7 +17,8 @@ def nearest(
 
     Args:
         slots: how many obstacles to tell of, at most.
-        fields: lists of floats over the obstacles, or arrays (k, cars).
+        fields: lists of floats over the obstacles, or arrays (k, cars) or (k, 1), the first of
+            them (k, cars).
         rims: distance to every rim, (k,) or (k, cars).
         functions: for this kind of component.
 
@@ -31,7 +32,8 @@ def nearest(
     if isinstance(rims, np.ndarray):
         return [], _picked(fields, order_of(rims)[:slots])
     order = _order_of_tensor(rims)[:slots]
-    picked = [field.gather(0, order) for field in fields]  # take_along_dim is 15 times slower
+    # take_along_dim would be 15 times slower.
+    picked = [field.expand(rims.shape).gather(0, order) for field in fields]
     return [field[i] for i in range(order.shape[0]) for field in picked], None
 
 
@@ -98,10 +100,12 @@ def merge_sort(count: int) -> tuple[tuple[int, int], ...]:
 def _picked(fields: list[np.ndarray], order: np.ndarray) -> np.ndarray:
     """The fields in this order, side by side: (cars, fields x len(order))."""
     width, (count, cars) = len(fields), fields[0].shape
-    together = np.empty((count * cars, width), dtype=fields[0].dtype)
-    for i, field in enumerate(fields):
-        together[:, i] = field.ravel()
+    table = np.empty((count, cars, width), dtype=fields[0].dtype)
+    for i, field in enumerate(fields):  # those that all cars share have one column
+        table[:, :, i] = field
     where = np.empty((cars, len(order)), dtype=np.intp)
     np.multiply(order.T, cars, out=where)
     where += np.arange(cars)[:, None]
-    return np.take(together, where.ravel(), axis=0).reshape(cars, len(order) * width)
+    return np.take(table.reshape(-1, width), where.ravel(), axis=0).reshape(
+        cars, len(order) * width
+    )

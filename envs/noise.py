@@ -20,8 +20,8 @@ from gymnasium.utils import seeding
 
 #: Words made into variates at a time, so that they stay in the cache.
 _TOGETHER = 2**14
-#: Words fetched ahead for all generators together, 32 MiB of them, and episodes for one.
-_WORDS_AHEAD, _EPISODES_AHEAD = 2**22, 16
+#: Words fetched ahead for all generators together, 128 MiB at most, and episodes for one.
+_WORDS_AHEAD, _EPISODES_AHEAD = 2**24, 16
 
 
 def draw_words(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -35,7 +35,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
-from slipcar.envs.arrays import FLOATS, Functions, array_namespace, functions_of
+from slipcar.envs.arrays import ARRAYS, FLOATS, Functions, array_namespace
 from slipcar.envs.nearest import nearest
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.validate import checked_int
@@ -207,15 +207,13 @@ def observe(
     from slipcar.envs.transition import proximity
 
     layout = Layout(kind, slots)
-    # One row at least, so that every component is an array.
-    states = np.atleast_2d(x)
+    states = x.reshape(-1, x.shape[-1])
+    times = np.broadcast_to(np.asarray(t, dtype=np.float64), x.shape[:-1]).reshape(-1)
     p = Parameters.like(states[..., 0], scenario)
     components = [states[..., i] for i in range(5)]
-    functions = functions_of(components[0])
-    rims = proximity(p, components, functions)[2] if slots else []
-    seen = entries(layout, p, np.asarray(t, dtype=np.float64), components, rims, functions)
-    out = np.empty((*states.shape[:-1], layout.size), dtype=np.float32)
-    fill(out, *seen)
+    rims = proximity(p, components, ARRAYS)[2] if slots else []
+    out = np.empty((len(states), layout.size), dtype=np.float32)
+    fill(out, *entries(layout, p, times, components, rims, ARRAYS))
     return out.reshape(*x.shape[:-1], layout.size)
 
 
@@ -289,15 +287,13 @@ def _obstacles(
 def _seen(row: Any, x: Any, frame: Any, functions: Functions) -> list[Any]:
     """Centre − position, radius and 1, for one obstacle or for columns of them.
 
-    A fleet's worlds are filled up with obstacles of radius −∞, infinitely far away: four zeros.
+    A fleet's worlds are filled up with obstacles that are not there: four zeros.
     """
-    dx, dy = row[0] - x[0], row[1] - x[1]
-    radius = functions.positive(row[2]) + 0.0 * dx
-    present = 1.0 * (row[2] > 0.0) + 0.0 * dx
+    radius, present = row[4], row[5]
+    dx, dy = present * (row[0] - x[0]), present * (row[1] - x[1])
     if frame is not None:
         dx, dy = _turned(frame, dx, dy)
-    dx, dy = functions.bounded([present * dx, present * dy], _WIDE)
-    return [dx, dy, radius, present]
+    return [*functions.bounded([dx, dy], _WIDE), radius, present]
 
 
 def _turned(frame: tuple[Any, Any], dx: Any, dy: Any) -> tuple[Any, Any]:

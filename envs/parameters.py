@@ -22,8 +22,8 @@ class Parameters(NamedTuple):
         horizon: T [s].
         slip: (α², β²).
         process: pairs (component of the state, standard deviation per √s).
-        obstacles: four columns over the k obstacles: x, y, radius, radius + clearance [m]; lists of
-            floats, or arrays (k, 1) or (k, cars).
+        obstacles: columns over the k obstacles, see :func:`obstacle_columns`; lists of floats, or
+            arrays (k, 1) or (k, cars).
         obstacle_weight: λ.
         goal: x^f, five components.
         goal_weight: W, five components.
@@ -46,7 +46,7 @@ class Parameters(NamedTuple):
             horizon=float(scenario.horizon),
             slip=scenario.slip.tolist(),
             process=scenario.process,
-            obstacles=obstacle_columns(scenario).tolist(),
+            obstacles=obstacle_columns(scenario.obstacles, scenario.clearance).tolist(),
             obstacle_weight=float(scenario.obstacle_weight),
             goal=scenario.goal.tolist(),
             goal_weight=scenario.goal_weight.tolist(),
@@ -60,13 +60,23 @@ class Parameters(NamedTuple):
             return p
         xp = array_namespace(component)
         columns = xp.asarray(
-            obstacle_columns(scenario), dtype=component.dtype, device=device(component)
+            obstacle_columns(scenario.obstacles, scenario.clearance),
+            dtype=component.dtype,
+            device=device(component),
         )
-        shape = (4, -1, *(1 for _ in component.shape))
+        shape = (len(columns), -1, *(1 for _ in component.shape))
         return p._replace(obstacles=tuple(xp.reshape(columns, shape)))
 
 
-def obstacle_columns(scenario: Scenario) -> np.ndarray:
-    """x, y, radius and radius + clearance of the obstacles, (4, k) [m]."""
-    x, y, radius = scenario.obstacles.T
-    return np.stack([x, y, radius, radius + scenario.clearance])
+def obstacle_columns(obstacles: np.ndarray, clearance: float) -> np.ndarray:
+    """What a step and an observation need of obstacles (..., k, 3), (6, ..., k).
+
+    x, y [m]; the radius δ [m]; (δ + ε)² [m²]; and, for observations, the radius again and 1.
+    """
+    x, y, radius = np.moveaxis(obstacles, -1, 0)
+    reach = radius + clearance
+    return np.stack([x, y, radius, reach * reach, radius, np.ones_like(radius)])
+
+
+#: The column of an obstacle that is not there: infinitely far away, and four zeros to be seen.
+ABSENT = (1e9, 1e9, -np.inf, 0.0, 0.0, 0.0)

@@ -86,10 +86,10 @@ def proximity(p: Parameters, x: Components, functions: Functions) -> tuple[Any, 
 
 def _near(x: Components, row: Components, functions: Functions) -> tuple[Any, Any]:
     """max(0, c_o)² and the distance to the rim, for one obstacle or for columns of them."""
-    centre_x, centre_y, radius, reach = row
+    centre_x, centre_y, radius, squared_reach = row[:4]
     dx, dy = x[0] - centre_x, x[1] - centre_y
     squared = dx * dx + dy * dy
-    depth = cost.ring_depth(squared, reach)
+    depth = cost.ring_depth(squared, squared_reach)
     return (
         cost.hinge_cost(depth, functions.positive),
         cost.rim_distance(squared, radius, functions.sqrt),
