@@ -8,6 +8,8 @@ PYTHON ?= python3
 ARGS ?=
 # Processes that share the episodes of `compare` and `frontier`; the numbers do not depend on it.
 WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 1)
+# Processes that share the tests; each compiles the planner for itself where the cache is empty.
+TESTERS ?= 2
 # Options of pip for torch alone, say --index-url with the address of a CPU-only build.
 TORCH_ARGS ?=
 
@@ -45,7 +47,7 @@ compare: $(INSTALLED)  ## the main job: SCP, feedback and PPO over the same nois
 	$(BIN)/slipcar compare --workers $(WORKERS) $(ARGS)
 
 test: $(INSTALLED)  ## all tests but the long ones
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(TESTERS) $(ARGS)
 
 test-long: $(INSTALLED)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m long $(ARGS)

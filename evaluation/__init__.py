@@ -4,7 +4,8 @@
     c = compare({"SCP": OpenLoop(p), "PPO": policy}, scenario, episodes=10_000, seed=0)
     c.frame, c.to_markdown(), c.save("results/mine")
 
-The command line `slipcar compare|frontier|plan|simulate|train` is :mod:`slipcar.evaluation.cli`.
+The command line `slipcar compare|frontier|plan|simulate|train|dataset` is
+:mod:`slipcar.evaluation.cli`.
 """
 
 from slipcar.evaluation.compare import Comparison, compare, evaluate

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 _SCENARIO_HELP = (
     "which world: one of "
     + ", ".join(Scenario.names())
-    + "; random:SEED for a drawn one; or a .json file that Scenario.to_json wrote"
+    + "; random:SEED or family:NAME:SEED for a drawn one; or a .json file that "
+    "Scenario.to_json wrote"
 )
 #: A scenario, as an option; and one that may be left to the controller.
 ScenarioOption = Annotated[str, tyro.conf.arg(metavar="NAME|FILE", help=_SCENARIO_HELP)]
@@ -60,10 +62,16 @@ def read_scenario(text: str) -> Scenario:
         if not seed.isdecimal():
             raise ValueError(f"random:SEED needs a whole number >= 0, not {seed!r}")
         return Scenario.random(int(seed))
+    if kind == "family" and colon:
+        name, _, seed = seed.partition(":")
+        family = Family.named(name)
+        if not seed.isdecimal():
+            raise ValueError(f"family:NAME:SEED needs a whole number >= 0, not {seed!r}")
+        return family.sample(int(seed))
     if text not in Scenario.names():
         raise ValueError(
-            f"unknown scenario {text!r}: it is one of {Scenario.names()}, random:SEED, or a "
-            ".json file"
+            f"unknown scenario {text!r}: it is one of {Scenario.names()}, random:SEED, "
+            "family:NAME:SEED, or a .json file"
         )
     return Scenario.named(text)
 

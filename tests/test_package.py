@@ -3,11 +3,11 @@
 import ast
 import importlib
 import importlib.metadata
+import os
 import re
 import shutil
 import subprocess
 import sys
-import time
 import tomllib
 import zipfile
 from pathlib import Path
@@ -84,12 +84,18 @@ def test_importing_the_planner_imports_nothing_heavy():
 
 
 def test_importing_the_planner_takes_less_than_half_a_second():
-    """The one timing among the tests: an interpreter that starts, imports and ends."""
+    """The one timing among the tests: an interpreter that starts, imports and ends.
+
+    In seconds of the processor: those of the clock belong to whatever else runs.
+    """
 
     def seconds():
-        begin = time.perf_counter()
+        before = os.times()
         run("import slipcar.planner")
-        return time.perf_counter() - begin
+        after = os.times()
+        return (after.children_user - before.children_user) + (
+            after.children_system - before.children_system
+        )
 
     assert min(seconds() for _ in range(3)) < 0.5
 

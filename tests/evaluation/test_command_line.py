@@ -35,7 +35,20 @@ def test_help_teaches(capsys):
             "--compare-methods",
         ],
         "frontier": ["--episodes", "--scenario", "--out", "--seed", "--workers", "--prices"],
-        "simulate": ["--gif", "--frames", "--human", "feedback", "straight", "ppo"],
+        "simulate": [
+            "--controller",
+            "--video",
+            "--tiled",
+            "--overlay",
+            "--gif",
+            "--frames",
+            "--human",
+            "feedback",
+            "straight",
+            "receding",
+            "ppo",
+        ],
+        "dataset": ["--id", "--episodes", "--observation", "--exploration-noise", "--overwrite"],
         "train": ["--total-steps", "--learning-rate", "--folder", "--seed"],
     }
     for name, expected in options.items():
@@ -51,6 +64,8 @@ def test_help_teaches(capsys):
     [
         (["plan", "--scenario", "moon"], "unknown scenario 'moon'"),
         (["plan", "--scenario", "random:x"], "random:SEED needs a whole number"),
+        (["plan", "--scenario", "family:hard:1"], "unknown family 'hard'"),
+        (["plan", "--scenario", "family:easy"], "family:NAME:SEED needs a whole number"),
         (["plan", "--scenario", "nowhere.json"], "nowhere.json"),
         (["plan", "--variance-weight", "-1"], "variance_weight must be finite and >= 0"),
         (["plan", "--save", "plan.txt"], "ends in .npz"),
