@@ -20,6 +20,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from slipcar.envs import SlipCarVectorEnv
@@ -73,9 +74,10 @@ class SB3VecEnv(VecEnv):
             ValueError: for an unknown option, or one that not all are given.
         """
         seeds = list(self._seeds) if any(s is not None for s in self._seeds) else None
-        observation, _ = self.env.reset(seed=seeds, options=_together(self._options))
+        given = self._options
         self._reset_seeds()
         self._reset_options()
+        observation, _ = self.env.reset(seed=seeds, options=_together(given))
         self._totals[:] = 0.0
         self._lengths[:] = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -168,8 +170,9 @@ class SB3VecEnv(VecEnv):
         wrapper_class: Callable[..., gym.Wrapper[Any, Any, Any, Any]],
         indices: int | Iterable[int] | None = None,
     ) -> list[bool]:
-        """False for each index: there are no wrappers."""
-        return [False for _ in self._get_indices(indices)]
+        """True for Monitor, whose `info["episode"]` with unscaled returns is here; else False."""
+        wrapped = isinstance(wrapper_class, type) and issubclass(wrapper_class, Monitor)
+        return [wrapped for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """One picture (H, W, 3) each where the environment was made to draw them, else None."""

@@ -128,10 +128,16 @@ def tensor_functions() -> Functions:
         torch.sqrt,
         torch.relu,
         torch.clamp,
-        lambda values, limit: [torch.clamp(value, -limit, limit) for value in values],
+        _bounded_tensors,
         functools.partial(torch.sum, dim=0),
         functools.partial(torch.amin, dim=0),
     )
+
+
+def _bounded_tensors(values: Any, limit: float) -> list[Any]:
+    import torch
+
+    return [torch.clamp(value, -limit, limit) for value in values]
 
 
 def array_namespace(*arrays: Any) -> Any:

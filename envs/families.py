@@ -198,6 +198,8 @@ class Family:
         Raises:
             ValueError: for a level outside [0, 1].
         """
+        if not isinstance(other, Family):
+            raise ValueError(f"a curriculum leads to a Family, not to {other!r}")
         level = checked_float("level", level, at_least=0.0)
         if level > 1.0:
             raise ValueError(f"level must be between 0 and 1, not {level:g}")
@@ -222,7 +224,7 @@ class Family:
         Raises:
             ValueError: for an unknown name, listing the known ones.
         """
-        if name not in NAMED:
+        if not isinstance(name, str) or name not in NAMED:
             raise ValueError(f"unknown family {name!r}; the named ones are {cls.names()}")
         return cls(**NAMED[name])
 
@@ -248,7 +250,7 @@ class Family:
         """
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (json.JSONDecodeError, TypeError) as error:
             raise ValueError(f"not a family: the text is not JSON ({error})") from error
         if not isinstance(data, Mapping):
             raise ValueError(f"not a family: expected a JSON object, not {type(data).__name__}")

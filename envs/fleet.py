@@ -6,10 +6,13 @@ them. Where they differ each number is an array with one entry per car.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from slipcar.envs import car
 from slipcar.envs.families import Draw, Family
 from slipcar.envs.parameters import ABSENT, Parameters, obstacle_columns
 from slipcar.envs.scenario import Scenario
@@ -26,8 +29,18 @@ def source_of(value: Any) -> Source:
     """
     if isinstance(value, (Scenario, Family)):
         return value
-    if isinstance(value, str) and value.startswith("family:"):
-        return Family.named(value.removeprefix("family:"))
+    if isinstance(value, str):
+        if value.startswith("family:"):
+            return Family.named(value.removeprefix("family:"))
+        if not value.lstrip().startswith("{"):
+            return Scenario.named(value)
+        try:
+            value = json.loads(value)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"neither a scenario nor a family: no JSON ({error})") from error
+    # A family is told by its base: what a scenario must have, a start, it has not.
+    if isinstance(value, Mapping) and "base" in value and "start" not in value:
+        return Family.from_dict(value)
     return Scenario.of(value)
 
 
@@ -163,10 +176,10 @@ class Worlds:
             corner: Any = (here, *(slice(n) for n in field.shape[1:]))
             kept[corner] = field
 
-    def noise_columns(self, base: Scenario) -> list[int]:
-        """Where the variates of a scenario's noise belong among those of the fleet's."""
-        reached = [i for i, _ in self.parameters.process]
-        return [0, 1, 2, *(3 + reached.index(i) for i, _ in base.process)]
+    def noise_columns(self, reached: list[int]) -> list[int]:
+        """Where variates belong among the fleet's: three of the slip, then one for each state."""
+        known = [i for i, _ in self.parameters.process]
+        return [0, 1, 2, *(car.NOISE_DIM + known.index(i) for i in reached)]
 
     def _part(self, obstacles: int, process: set[int]) -> None:
         """Numbers of its own for every car, with room for obstacles and process noise."""

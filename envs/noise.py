@@ -13,7 +13,9 @@ and beyond it lies 1e-11 of the normal law.
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.utils import seeding
@@ -80,9 +82,9 @@ class Tapes:
         self._words = np.empty((count, 0), dtype=np.uint64)
         self._read = np.zeros(count, dtype=np.int64)
 
-    def seed(self, i: int, seed: int) -> None:
-        """Start generator i anew, as Gymnasium seeds a single environment."""
-        self._rngs[i] = seeding.np_random(seed)[0]
+    def start(self, i: int, rng: np.random.Generator) -> None:
+        """Read from another generator from now on."""
+        self._rngs[i] = rng
         self._read[i] = self._words.shape[1]
 
     def take(self, here: np.ndarray, count: int) -> np.ndarray:
@@ -125,17 +127,24 @@ class Tapes:
         self._read += grown
 
 
-def seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
-    """One seed for each of `count` generators: from None, from an int s (s + i), or as given.
+def generators(
+    seed: int | Sequence[int | None] | None, count: int
+) -> list[np.random.Generator | None]:
+    """One generator for each of `count` environments, seeded as Gymnasium seeds a single one.
+
+    From None (which leaves all as they are), from an int s (s + i), or as given.
 
     Raises:
         ValueError: for anything else.
+        gymnasium.error.Error: for a negative seed.
     """
     if seed is None:
         return [None] * count
-    if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool):
-        return [int(seed) + i for i in range(count)]
-    given = np.asarray(seed, dtype=object)
-    if given.shape != (count,):
-        raise ValueError(f"seed must be None, an int or {count} of them, not {seed!r}")
-    return [None if s is None else int(s) for s in given]
+    if isinstance(seed, numbers.Integral) and not isinstance(seed, bool):
+        seeds: list[Any] = [int(seed) + i for i in range(count)]
+    else:
+        seeds = list(seed) if isinstance(seed, (Sequence, np.ndarray)) else []
+        whole = [s is None or isinstance(s, numbers.Integral) for s in seeds]
+        if len(seeds) != count or not all(whole) or isinstance(seed, str):
+            raise ValueError(f"seed must be None, an int or {count} of them, not {seed!r}")
+    return [None if s is None else seeding.np_random(int(s))[0] for s in seeds]

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from slipcar.envs.episode import halves
-from slipcar.envs.validate import checked_array
 
 
 class NoiseStore:
@@ -45,7 +42,14 @@ class NoiseStore:
         if self.array.shape != shape:
             self.array = np.zeros(shape, dtype=np.float32)
 
-    def put(self, here: np.ndarray, noise: np.ndarray, where: list[int], columns: int) -> None:
+    def put(
+        self,
+        here: np.ndarray,
+        noise: np.ndarray,
+        where: list[int],
+        columns: int,
+        kept: list[int],
+    ) -> None:
         """New noise for some, beside that of others, which may be longer or have more columns.
 
         Args:
@@ -53,28 +57,24 @@ class NoiseStore:
             noise: in halves, (2, half, substeps, c, len(here)).
             where: to which columns its own belong, c of them.
             columns: how many there are in all.
+            kept: to which columns belong what was there before.
         """
         half = max(self.half, noise.shape[1])
         if (half, columns) != (self.half, self.columns):
             old = self._whole(self.array)
             self.fit(2 * half, columns)
-            self._give(self._everyone, old, list(range(old.shape[2])))
+            self._give(self._everyone, old, kept)
         self._give(here, self._whole(noise), where)
 
-    def give(self, here: np.ndarray, noise: Any, steps: int) -> None:
+    def give(self, here: np.ndarray, noise: np.ndarray, where: list[int]) -> None:
         """Noise from outside for some.
 
         Args:
             here: which episodes, indices.
-            noise: (count, steps, substeps, columns).
-            steps: control steps of the longest episode.
-
-        Raises:
-            ValueError: for another shape or a non-finite entry.
+            noise: (len(here), steps, substeps, c).
+            where: to which columns its own belong, c of them.
         """
-        shape = (self._count, steps, self._substeps, self.columns)
-        given = checked_array("noise", noise, shape)
-        self._give(here, np.moveaxis(given[here], 0, -1), list(range(self.columns)))
+        self._give(here, np.moveaxis(noise, 0, -1), where)
 
     def common(self, k: int) -> np.ndarray:
         """Variates of step k of all, indexed [substep, column, episode]."""

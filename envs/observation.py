@@ -175,16 +175,23 @@ def entries(
     # Never below one step: on the last observation there is nothing left to divide by.
     to_go = p.horizon - t
     rate = 1.0 / (max(to_go, p.dt) if isinstance(to_go, float) else _at_least(to_go, p.dt))
+    # The last node's time may be rounded to a little after the horizon.
+    fraction = 2.0 * t / p.horizon - 1.0
+    fraction = min(fraction, 1.0) if isinstance(fraction, float) else clip(fraction, -1.0, 1.0)
     seen = [
         *functions.bounded([dx / _POSITION_SCALE, dy / _POSITION_SCALE], _WIDE),
         cos,
         sin,
         *functions.bounded(x[3:5], _WIDE),
-        2.0 * t / p.horizon - 1.0,
+        fraction,
         *(clip(e * rate, -_RATE_LIMIT, _RATE_LIMIT) for e in (dx, dy, turn, v, omega)),
     ]
     if layout.kind == "egocentric":
-        seen += [to_go / _TIME_SCALE, p.slip[0] / _SLIP_SCALE[0], p.slip[1] / _SLIP_SCALE[1]]
+        rest = (
+            to_go / _TIME_SCALE,
+            *(s / scale for s, scale in zip(p.slip, _SLIP_SCALE, strict=True)),
+        )
+        seen += [_limited(value, functions) for value in rest]
     shown, block = _obstacles(layout, p, x, rims, functions, frame)
     return seen + shown, block
 
@@ -300,6 +307,13 @@ def _turned(frame: tuple[Any, Any], dx: Any, dy: Any) -> tuple[Any, Any]:
     """A vector's components ahead and to the left of a heading (cos, sin)."""
     cos, sin = frame
     return cos * dx + sin * dy, cos * dy - sin * dx
+
+
+def _limited(value: Any, functions: Functions) -> Any:
+    """Limited to [0, _WIDE], whether one for all cars or one for each."""
+    if isinstance(value, float):
+        return min(max(value, 0.0), _WIDE)
+    return functions.clip(value, 0.0, _WIDE)
 
 
 def _at_least(values: Any, low: Any) -> Any:

@@ -11,9 +11,11 @@ from gymnasium.vector import AutoresetMode
 from slipcar.envs.families import Family
 from slipcar.envs.fleet import Source, base_of, longest_horizon, most_obstacles
 from slipcar.envs.observation import Layout
+from slipcar.envs.validate import checked_array
 
 RENDER_MODES = ("rgb_array", "human")
 DTYPES = ("float32", "float64")
+_FARTHEST = 1e6  # beyond it a float32 cannot tell centimetres, nor an angle its direction
 
 
 def check_render_mode(mode: str | None) -> str | None:
@@ -50,6 +52,29 @@ def dtype_of(dtype: Any) -> Any:
         if dtype == name or dtype == np.dtype(name):
             return np.dtype(name).type
     raise ValueError(f"unknown dtype {dtype!r}; allowed are {list(DTYPES)}")
+
+
+def checked_flag(name: str, value: Any) -> bool:
+    """The value as a bool.
+
+    Raises:
+        ValueError: for anything but True and False.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, not {value!r}")
+    return bool(value)
+
+
+def checked_start(start: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """States that an episode may begin in.
+
+    Raises:
+        ValueError: for another shape, or an entry that is not finite or beyond 10⁶.
+    """
+    states = checked_array("start", start, shape)
+    if np.abs(states).max() > _FARTHEST:
+        raise ValueError(f"start must lie within ±{_FARTHEST:g}, not at {states.tolist()}")
+    return states
 
 
 def layout_for(source: Source, kind: str, slots: int | None) -> Layout:
@@ -99,6 +124,8 @@ def read_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> l
     Raises:
         ValueError: for an unknown one.
     """
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"options must be a dictionary, not {options!r}")
     given = dict(options or {})
     values = [given.pop(name, None) for name in known]
     if given:

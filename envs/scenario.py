@@ -115,6 +115,15 @@ class Scenario:
                     )
         return obstacles
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scenario:
+        return self  # frozen: there is nothing to copy
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        for value in state.values():
+            if isinstance(value, np.ndarray):  # pickles come back writable
+                value.setflags(write=False)
+
     # ---------------------------------------------------------------- identity and variants
 
     def __eq__(self, other: object) -> bool:

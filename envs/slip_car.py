@@ -20,6 +20,8 @@ from slipcar.envs.options import (
     RENDER_MODES,
     check_render_mode,
     check_source,
+    checked_flag,
+    checked_start,
     layout_for,
     read_options,
 )
@@ -111,7 +113,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         self.source = source_of(scenario)
         self.layout = layout_for(self.source, observation, obstacle_slots)
         self.substeps = checked_int("substeps", substeps, at_least=1)
-        self.terminate_on_collision = bool(terminate_on_collision)
+        self.terminate_on_collision = checked_flag("terminate_on_collision", terminate_on_collision)
         self.render_mode = check_render_mode(render_mode)
         #: What is drawn over the scene beside the trail; see :class:`slipcar.envs.overlay.Overlay`.
         self.overlay: Overlay | None = None
@@ -157,16 +159,16 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: for an unknown option or a bad value of one.
         """
-        super().reset(seed=seed)
         given, start, noise = read_options(options, ("scenario", "start", "noise"))
         source = self.source if given is None else source_of(given)
         if source is not self.source:
             check_source(self.layout, self.observation_space, source)
         base = base_of(source)
         if start is not None:
-            start = checked_array("start", start, (STATE_DIM,))
+            start = checked_start(start, (STATE_DIM,))
         if noise is not None:
             noise = checked_array("noise", noise, (base.nodes - 1, self.substeps, base.noise_dim))
+        super().reset(seed=seed)  # all that can be wrong but the seed has been found
         self.source = source
         episode = draw_episode(self.np_random, source, self.substeps)
         self._scenario = episode.scenario
@@ -249,6 +251,10 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
             self._screen.enter(self._scenario)
         collided = self._distance < 0.0
         return self._screen.draw(np.array(self._trail), collided=collided, overlay=self.overlay)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles draw anew: pygame's surfaces cannot be copied."""
+        return {**vars(self), "_screen": None}
 
     def close(self) -> None:
         """Close the window, if any."""

@@ -240,7 +240,7 @@ class SlipCarTorchEnv(VectorEnv["Tensor", "Tensor", "Tensor"]):
                 "goal": goal,
                 "cost": seen.inside.to(self.dtype),
                 "collision": self._least < 0.0,
-                "clearance": self._least,
+                "clearance": self._least.clone(),
                 "control": seen.control,
                 "is_success": success,
             }

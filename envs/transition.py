@@ -165,8 +165,11 @@ def limited_action(action: ArrayLike, batch: tuple[int, ...], dtype: Any) -> np.
         ValueError: for a wrong shape or a non-finite entry, naming its index.
     """
     try:
-        array: np.ndarray = np.asarray(action, dtype=dtype)
-    except (TypeError, ValueError) as error:
+        if np.iscomplexobj(action):  # NumPy would only warn and drop the imaginary part
+            raise TypeError("complex numbers")
+        with np.errstate(over="ignore"):
+            array: np.ndarray = np.asarray(action, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"action must be an array of numbers, not {action!r}") from error
     if array.shape != (*batch, car.CONTROL_DIM):
         raise ValueError(f"action must have shape {(*batch, car.CONTROL_DIM)}, not {array.shape}")
@@ -174,9 +177,13 @@ def limited_action(action: ArrayLike, batch: tuple[int, ...], dtype: Any) -> np.
     if array.max() <= 1.0 and array.min() >= -1.0:
         return array
     if not np.isfinite(array).all():
+        array = np.asarray(
+            action, dtype=np.float64
+        )  # what float32 cannot hold is finite all the same
+    if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(
             f"action{list(index)} is {array[index]}; actions must be finite "
             "(they are clipped to [-1, 1])"
         )
-    return np.clip(array, -1.0, 1.0)
+    return np.clip(array, -1.0, 1.0).astype(dtype, copy=False)

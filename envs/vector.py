@@ -16,16 +16,19 @@ from gymnasium.vector.utils import batch_space
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.arrays import ARRAYS
+from slipcar.envs.car import NOISE_DIM, STATE_DIM
 from slipcar.envs.cost import arrived
 from slipcar.envs.episode import read_episodes, words_for_episode
 from slipcar.envs.fleet import Source, Worlds, base_of, longest_horizon, source_of
-from slipcar.envs.noise import Tapes, seeds_of
+from slipcar.envs.noise import Tapes, generators
 from slipcar.envs.noise_store import NoiseStore
 from slipcar.envs.options import (
     RENDER_MODES,
     autoreset_mode_of,
     check_render_mode,
     check_source,
+    checked_flag,
+    checked_start,
     dtype_of,
     layout_for,
     read_options,
@@ -94,7 +97,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = checked_int("num_envs", num_envs, at_least=1)
         self.layout = layout_for(source_of(scenario), observation, obstacle_slots)
         self.substeps = checked_int("substeps", substeps, at_least=1)
-        self.terminate_on_collision = bool(terminate_on_collision)
+        self.terminate_on_collision = checked_flag("terminate_on_collision", terminate_on_collision)
         self._sources: list[Source] = [source_of(scenario)]
         self._source_of = np.zeros(self.num_envs, dtype=np.int64)
         base = base_of(self._sources[0])
@@ -118,6 +121,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._common_step: int | None = 0
         self._distance = np.full(self.num_envs, np.inf, dtype=self._dtype)
         self._over = np.ones(self.num_envs, dtype=bool)
+        self._began = np.zeros(self.num_envs, dtype=bool)  # whether there has been an episode
         self._no_truncation = np.zeros(self.num_envs, dtype=bool)
         self._gallery: Gallery | None = None
         if render_mode is not None:
@@ -140,11 +144,11 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     @property
     def scenarios(self) -> list[Scenario]:
         """The world that each sub-environment is in, `num_envs` of them."""
-        if not self._ready:
-            return [base_of(self._sources[0])] * self.num_envs
         return [self._world(i) for i in range(self.num_envs)]
 
     def _world(self, i: int) -> Scenario:
+        if not self._began[i]:
+            return base_of(self._sources[self._source_of[i]])
         return self._worlds.scenario(i, self._sources[self._source_of[i]])
 
     @property
@@ -176,20 +180,27 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         known = ("reset_mask", "scenario", "start", "noise")
         mask, given, start, noise = read_options(options, known)
+        # All that can be wrong is found before anything is changed.
         here = self._masked(mask)
-        seeds = seeds_of(seed, self.num_envs)
-        if given is not None:
-            self._take_sources(here, given)
+        rngs = generators(seed, self.num_envs)
+        sources = self._sources_with(here, given)
+        if start is not None:
+            start = checked_start(start, (self.num_envs, STATE_DIM))
+        reached = sorted({i for s in sources[0] for i, _ in base_of(s).process})
+        if noise is not None:
+            steps = max(base_of(s).nodes - 1 for s in sources[0])
+            shape = (self.num_envs, steps, self.substeps, NOISE_DIM + len(reached))
+            noise = checked_array("noise", noise, shape)
+        self._sources, self._source_of = sources
         for i in here:
-            if (own := seeds[i]) is not None:
-                self._tapes.seed(int(i), own)
+            if (rng := rngs[i]) is not None:
+                self._tapes.start(int(i), rng)
         self._ready = True
         self._start(here)
         if start is not None:
-            starts = checked_array("start", start, (self.num_envs, 5))
-            self._put_at(here, starts[here].T)
+            self._put_at(here, start[here].T)
         if noise is not None:
-            self._noise.give(here, noise, int(self._worlds.steps.max()))
+            self._noise.give(here, noise[here], self._worlds.noise_columns(reached))
         distance, observation = self._look()
         started = np.zeros(self.num_envs, dtype=bool)
         started[here] = True
@@ -207,25 +218,27 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         return np.flatnonzero(mask)
 
-    def _take_sources(self, here: np.ndarray, given: Any) -> None:
-        """Let the sub-environments `here` draw from what the option `scenario` says."""
+    def _sources_with(self, here: np.ndarray, given: Any) -> tuple[list[Source], np.ndarray]:
+        """What there is to draw from, and who does, once `here` are given the option `scenario`."""
+        if given is None:
+            return self._sources, self._source_of
         if isinstance(given, (list, tuple)):
             if len(given) != self.num_envs:
                 raise ValueError(
                     f"scenario must be one or a list of {self.num_envs}, not of {len(given)}"
                 )
-            sources = [source_of(value) for value in given]
+            named = {id(value): source_of(value) for value in given}
+            new = [named[id(value)] for value in given]
         else:
-            sources = [source_of(given)] * self.num_envs
-        for source in {id(source): source for source in sources}.values():
-            check_source(self.layout, self.single_observation_space, source)
+            new = [source_of(given)] * self.num_envs
         chosen = [self._sources[s] for s in self._source_of]
         for i in here:
-            chosen[i] = sources[i]
-        distinct = {id(source): source for source in chosen}
-        number = {key: n for n, key in enumerate(distinct)}
-        self._sources = list(distinct.values())
-        self._source_of = np.array([number[id(source)] for source in chosen])
+            chosen[i] = new[i]
+        number: dict[Source, int] = {}
+        which = np.array([number.setdefault(source, len(number)) for source in chosen])
+        for source in number:
+            check_source(self.layout, self.single_observation_space, source)
+        return list(number), which
 
     def _start(self, here: np.ndarray) -> None:
         """New episodes in the sub-environments `here` (indices)."""
@@ -239,6 +252,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._step[here] = 0
         self._distance[here] = np.inf
         self._over[here] = False
+        self._began[here] = True
         together = len(here) == self.num_envs or bool((self._step == 0).all())
         self._common_step = 0 if together else None
 
@@ -252,10 +266,16 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             episodes = read_episodes(source, words, self.substeps, self._noise.array)
         else:
             episodes = read_episodes(source, words, self.substeps)
+            before = [i for i, _ in worlds.parameters.process]
             if worlds.shared is not source:
                 worlds.put(here, source, episodes.drawn)
-            columns = 3 + len(worlds.parameters.process)
-            self._noise.put(here, episodes.noise, worlds.noise_columns(base), columns)
+            self._noise.put(
+                here,
+                episodes.noise,
+                where=worlds.noise_columns([i for i, _ in base.process]),
+                columns=NOISE_DIM + len(worlds.parameters.process),
+                kept=worlds.noise_columns(before),
+            )
         start = worlds.start[:, here]
         if episodes.deviations is not None:
             start = start + base.start_deviation[:, None] * episodes.deviations.T
@@ -321,22 +341,26 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _move(self, u: np.ndarray) -> tuple[Moved, np.ndarray]:
         """One step of all, and what they see then."""
         noise, observation = self._noise_now(), self._blank()
-        effort, obstacle, distance = np.empty((3, self.num_envs), dtype=self._dtype)
         self._step += 1
         if self._common_step is not None:
             self._common_step += 1
+        effort = obstacle = distance = np.empty(0)
+        if len(self._parts) > 1:
+            effort, obstacle, distance = np.empty((3, self.num_envs), dtype=self._dtype)
         for here in self._parts:
             p = self._worlds.part(here)
             add = functools.partial(self._add, here)
             moved = step(p, self._rounded[:, here], u[:, here], noise[..., here], ARRAYS, add)
+            self._observe(p, here, moved.rims, observation)
+            if len(self._parts) == 1:
+                return moved, observation
             effort[here], obstacle[here] = moved.effort, moved.obstacle
             distance[here] = moved.distance
-            self._observe(p, here, moved.rims, observation)
         return Moved(None, effort, obstacle, distance, None), observation
 
     def _add(self, here: slice, x: Any, added: list[np.ndarray]) -> np.ndarray:
         """Add to the states, and give them as increments take them."""
-        self._x[:, here] += np.stack(added)
+        self._x[:, here] += np.concatenate(added).reshape(len(added), -1)
         rounded = self._rounded[:, here]
         rounded[:] = self._x[:, here]
         return rounded

@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
+from slipcar.envs.vector import SlipCarVectorEnv
+
 
 class SparseSuccess(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Reward 1 at the end of an episode that succeeds, else 0.
@@ -31,7 +33,7 @@ class VectorSparseSuccess(VectorWrapper):
 
     def __init__(self, env: VectorEnv) -> None:
         super().__init__(env)
-        if not hasattr(env.unwrapped, "layout"):
+        if not isinstance(env.unwrapped, SlipCarVectorEnv):
             raise ValueError(f"VectorSparseSuccess wraps a SlipCarVectorEnv, not {env.unwrapped!r}")
 
     def step(

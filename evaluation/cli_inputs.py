@@ -66,7 +66,10 @@ def read_scenario(text: str) -> Scenario:
         name, _, seed = seed.partition(":")
         family = Family.named(name)
         if not seed.isdecimal():
-            raise ValueError(f"family:NAME:SEED needs a whole number >= 0, not {seed!r}")
+            raise ValueError(
+                f"family:NAME:SEED needs a whole number >= 0 after {name!r}, not {seed!r}: one "
+                f"world of a family, such as family:{name}:0"
+            )
         return family.sample(int(seed))
     if text not in Scenario.names():
         raise ValueError(
@@ -90,6 +93,7 @@ def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, S
         OSError: if the file cannot be read.
     """
     from slipcar import baselines
+    from slipcar.evaluation.rows import chargeable
     from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
 
     path = Path(text)
@@ -107,9 +111,9 @@ def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, S
         return (OpenLoop(stored) if stored.gains is None else Feedback(stored)), world
     world = scenario or Scenario.named("paper")
     if text == "scp":
-        return OpenLoop(plan(world)), world
+        return OpenLoop(plan(world, variance_weight=chargeable(world))), world
     if text == "feedback":
-        return Feedback(plan(world)), world
+        return Feedback(plan(world, variance_weight=chargeable(world))), world
     if text == "planned-feedback":
         return Feedback(plan(world, feedback=True)), world
     if text == "receding":

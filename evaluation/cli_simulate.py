@@ -93,6 +93,8 @@ def simulate(
         raise ValueError(f"who drives, {driver!r} or --controller {controller!r}?")
     named = driver or controller or _DEFAULT
     filmed = video is not None or gif is not None or frames is not None or human
+    if tiled and not filmed:
+        raise ValueError("--tiled needs --video, --gif, --frames or --human: it lays out a film")
     _check_files(figure, video, gif, frames)
     if filmed:
         _check_pictures(episodes, video is not None)

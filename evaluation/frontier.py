@@ -154,10 +154,12 @@ def candidates(
     """The points, and what a reader must be told; plans that did not converge are left out."""
     scenario.action_scale  # noqa: B018  raises now if it is unbounded
     notes: list[str] = []
-    plan(scenario)  # so that planning times are warm ones, without first-call costs
+    weight = rows.chargeable(scenario)
+    # So that planning times are warm ones, without first-call costs.
+    plan(scenario, variance_weight=weight)
     plan(scenario, feedback=True)
     deterministic = baselines.deterministic_scp(scenario)
-    stochastic = plan(scenario)
+    stochastic = plan(scenario, variance_weight=weight)
     points = [
         Point(rows.DETERMINISTIC, SINGLE, float("nan"), OpenLoop(deterministic)),
         Point(rows.STOCHASTIC, SINGLE, float("nan"), OpenLoop(stochastic)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +40,10 @@ class Gallery:
         self._human, self._fps = human, fps
         self._trails: list[list[np.ndarray]] = [[] for _ in range(self.shown)]
         self._tiles: Tiles | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles draw anew: pygame's surfaces cannot be copied."""
+        return {**vars(self), "_tiles": None}
 
     def record(self, states: np.ndarray, started: np.ndarray, *, moved: bool) -> None:
         """Take down where the cars are now.

@@ -1,5 +1,6 @@
 """The adapter against Stable-Baselines3's own way of vectorising, and its episode ends."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -126,7 +127,8 @@ def test_evaluate_policy_agrees_with_score():
 def test_sub_environments_share_attributes():
     ours = adapter(3)
     assert ours.get_attr("scenario", indices=[0, 2]) == [PAPER, PAPER]
-    assert ours.env_is_wrapped(Monitor) == [False] * 3
+    assert ours.env_is_wrapped(Monitor) == [True] * 3
+    assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * 3
     with pytest.raises(AttributeError):
         ours.get_attr("no_such_thing")
     with pytest.raises(NotImplementedError, match="share"):

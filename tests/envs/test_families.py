@@ -2,6 +2,7 @@
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -89,6 +90,15 @@ def test_json_gives_back_an_equal_family(family):
     again = Family.from_json(family.to_json())
     assert again == family
     assert again.sample(3) == family.sample(3)
+
+
+@pytest.mark.parametrize("form", [Family.to_json, Family.to_dict])
+def test_an_environment_takes_a_family_as_data(form):
+    env = SlipCarEnv(form(RICH))
+    assert env.source == RICH
+    spec = gym.make("slipcar.envs:SlipCar-v0", scenario=form(RICH)).spec
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json()))
+    assert again.unwrapped.source == RICH
 
 
 def test_every_episode_draws_a_new_world_alike_in_both_environments():

@@ -5,7 +5,7 @@ import pytest
 from gymnasium.utils import seeding
 from scipy import stats
 
-from slipcar.envs.noise import Tapes, draw_words, normals, seeds_of, uniforms
+from slipcar.envs.noise import Tapes, draw_words, generators, normals, uniforms
 
 WORDS = np.random.default_rng(0).integers(0, 2**64, size=(500, 600), dtype=np.uint64)
 
@@ -65,7 +65,7 @@ def test_tapes_are_read_in_order_however_far_ahead_they_fetch(sizes):
     count, rng = 4, np.random.default_rng(2)
     tapes, expected = Tapes(count), [seeding.np_random(10 + i)[0] for i in range(count)]
     for i in range(count):
-        tapes.seed(i, 10 + i)
+        tapes.start(i, seeding.np_random(10 + i)[0])
     for size in sizes:
         here = np.flatnonzero(rng.random(count) < 0.6)
         if len(here) == 0:
@@ -78,15 +78,15 @@ def test_tapes_are_read_in_order_however_far_ahead_they_fetch(sizes):
 def test_seeding_a_tape_starts_it_anew_and_leaves_the_others_alone():
     tapes, everyone = Tapes(2), np.arange(2)
     for i in range(2):
-        tapes.seed(i, i)
+        tapes.start(i, seeding.np_random(i)[0])
     first, second = tapes.take(everyone, 9).copy(), tapes.take(everyone, 9).copy()
-    tapes.seed(0, 0)
+    tapes.start(0, seeding.np_random(0)[0])
     again = tapes.take(everyone, 9)
     np.testing.assert_array_equal(again[0], first[0])
     assert not np.isin(again[1], [first[1], second[1]]).any()
 
 
-@pytest.mark.parametrize("seed", [[1], (1, 2, 3), "ab", 1.5])
+@pytest.mark.parametrize("seed", [[1], (1, 2, 3), "ab", 1.5, [1.5, 2.5], {1, 2}])
 def test_bad_seeds(seed):
     with pytest.raises(ValueError, match="seed must be None, an int or 2 of them"):
-        seeds_of(seed, 2)
+        generators(seed, 2)

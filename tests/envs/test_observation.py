@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slipcar.envs import Scenario
+from slipcar.envs import Family, Scenario, SlipCarEnv, SlipCarVectorEnv
 from slipcar.envs.observation import (
     KINDS,
     LAYOUTS,
@@ -119,3 +119,21 @@ def test_unknown_kinds_list_the_known_ones(kind):
 def test_what_is_no_observation_cannot_be_decoded(shape):
     with pytest.raises(ValueError, match=r"12 \(features\) or 6 \(state\) or 15 \(egocentric\)"):
         decode(PAPER, np.zeros(shape))
+
+
+def test_the_last_node_lies_within_the_bounds_however_its_time_is_rounded():
+    worlds = [PAPER.replace(horizon=T, nodes=N) for T in (3.3, 5.7, 7.0) for N in (12, 26, 38)]
+    for kind in ("features", "egocentric"):
+        for world in worlds:
+            env = SlipCarEnv(world, observation=kind)
+            env.reset(seed=0)
+            over = False
+            while not over:
+                observation, _, over, _, _ = env.step(np.zeros(2))
+            assert env.observation_space.contains(observation)
+        family = Family(horizon=(3.0, 7.0), base=Scenario.named("open").replace(nodes=38))
+        envs = SlipCarVectorEnv(64, family, observation=kind, autoreset_mode="Disabled")
+        envs.reset(seed=0)
+        for _ in range(37):
+            observations, *_ = envs.step(np.zeros((64, 2)))
+        assert all(envs.single_observation_space.contains(o) for o in observations)

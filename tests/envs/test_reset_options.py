@@ -1,5 +1,6 @@
 """Another world, start or noise at reset, in one environment and in many."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -62,6 +63,41 @@ def test_each_sub_environment_may_have_its_own(mode):
         over = terminated.copy()
     envs.reset(seed=1, options={"scenario": "paper"})  # and together again
     assert envs.scenarios == [PAPER] * 3
+
+
+ON_SPEED = Scenario.named("open").replace(process_noise=(0, 0, 0, 0.3, 0))
+ON_POSITION = Scenario.named("open").replace(process_noise=(0.3, 0, 0, 0, 0))
+
+
+@pytest.mark.parametrize("worlds", [[ON_SPEED, ON_POSITION], [ON_POSITION, ON_SPEED]])
+def test_each_world_has_its_own_process_noise(worlds):
+    envs = SlipCarVectorEnv(2, "open", dtype="float64")
+    envs.reset(seed=5, options={"scenario": worlds})
+    for _ in range(10):
+        envs.step(np.zeros((2, 2)))
+    for i, world in enumerate(worlds):
+        env = SlipCarEnv(world)
+        env.reset(seed=5 + i)
+        for _ in range(10):
+            env.step(np.zeros(2))
+        np.testing.assert_allclose(envs.states[i], env.state, rtol=1e-12)
+        assert np.abs(env.state).max() > 0.05
+
+
+def test_a_newcomer_leaves_the_others_on_their_paths():
+    newcomers = [ON_POSITION, PAPER.replace(nodes=81), Family.named("easy"), SLALOM]
+    for newcomer in newcomers:
+        envs, alone = SlipCarVectorEnv(2, ON_SPEED), SlipCarVectorEnv(2, ON_SPEED)
+        for each in (envs, alone):
+            each.reset(seed=0)
+        for k in range(30):
+            if k == 5:
+                mask = np.array([False, True])
+                envs.reset(options={"reset_mask": mask, "scenario": newcomer})
+            for each in (envs, alone):
+                each.step(np.full((2, 2), 0.1))
+        np.testing.assert_array_equal(envs.states[0], alone.states[0])
+        assert envs.scenarios[0] == ON_SPEED
 
 
 def test_a_harder_family_may_follow_an_easy_one():
@@ -150,10 +186,36 @@ def test_other_refusals():
         SlipCarVectorEnv(3, dtype="float16")
 
 
-def test_a_refused_reset_changes_nothing():
-    env = SlipCarEnv(obstacle_slots=4)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="8 obstacles"):
-        env.reset(options={"scenario": Scenario.random(0, 8)})
+REFUSED = [
+    {"options": {"foo": 1}},
+    {"options": [1]},
+    {"options": {"scenario": Scenario.random(0, 8)}},
+    {"options": {"scenario": "slalom", "start": np.ones(2)}},
+    {"options": {"scenario": "slalom", "noise": np.zeros((3, 1, 3))}},
+    {"options": {"start": np.full(5, np.nan)}},
+    {"options": {"start": np.full(5, 1e20)}},
+    {"seed": -5},
+]
+
+
+@pytest.mark.parametrize("arguments", REFUSED)
+@pytest.mark.parametrize(
+    "make", [SlipCarEnv, lambda **kw: SlipCarVectorEnv(1, autoreset_mode="SameStep", **kw)]
+)
+def test_a_refused_reset_changes_nothing(make, arguments):
+    env, plain = make(obstacle_slots=4), make(obstacle_slots=4)
+    shape = env.action_space.shape
+    for each in (env, plain):
+        each.reset(seed=0)
+        each.step(np.full(shape, 0.3))
+    with pytest.raises((ValueError, gym.error.Error)):
+        env.reset(**{"seed": 3, **arguments})
     assert env.scenario == PAPER
-    env.step(np.zeros(2))
+    for _ in range(5):
+        here, there = (each.step(np.full(shape, 0.3)) for each in (env, plain))
+        np.testing.assert_array_equal(here[0], there[0])
+    for each in (env, plain):  # and the generators stand where they stood
+        each.reset()
+    for _ in range(5):
+        here, there = (each.step(np.full(shape, 0.3)) for each in (env, plain))
+    np.testing.assert_array_equal(here[0], there[0])

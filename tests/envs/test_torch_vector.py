@@ -282,3 +282,16 @@ def test_compiled_steps_are_the_same(source):
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
         for name in ("effort", "obstacle", "cost", "clearance", "control"):
             torch.testing.assert_close(ours[4][name], theirs[4][name], rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_handed_out_is_the_callers_own():
+    envs, plain = (SlipCarTorchEnv(3, SHORT, seed=0) for _ in range(2))
+    for each in (envs, plain):
+        each.reset(seed=0)
+    for action in torch.from_numpy(actions_for(3, 4)):
+        observation, reward, _, _, info = envs.step(action)
+        expected = plain.step(action)[4]
+        torch.testing.assert_close(info["clearance"], expected["clearance"])
+        for tensor in (observation, reward, *info.values()):
+            if isinstance(tensor, torch.Tensor) and tensor.is_floating_point():
+                tensor.fill_(-7.0)

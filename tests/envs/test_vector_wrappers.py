@@ -1,5 +1,8 @@
 """Gymnasium's own vector wrappers over the native environment."""
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -113,3 +116,22 @@ def test_rendering_needs_a_mode_and_a_reset():
         make(render_mode="rgb_array").unwrapped.render()
     with pytest.warns(UserWarning, match="without a render_mode does nothing"):
         assert make().unwrapped.render() is None
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_go_on_alike_and_draw(duplicate):
+    pytest.importorskip("pygame")
+    env = gym.make(ENV_ID, render_mode="rgb_array").unwrapped
+    for each in (env, make(render_mode="rgb_array").unwrapped):
+        each.reset(seed=0)
+        each.render()
+        again = duplicate(each)
+        action = np.full(each.action_space.shape, 0.5, dtype=np.float32)
+        for _ in range(3):
+            mine, theirs = each.step(action), again.step(action)
+        np.testing.assert_array_equal(mine[0], theirs[0])
+        np.testing.assert_array_equal(each.render(), again.render())
+    scenario = duplicate(SHORT)
+    assert scenario == SHORT
+    with pytest.raises(ValueError, match="read-only"):
+        scenario.obstacles[0, 0] = 1.0

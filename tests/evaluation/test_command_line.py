@@ -5,10 +5,11 @@ import sys
 import numpy as np
 import pytest
 
-from slipcar.envs import Scenario
+from slipcar.envs import Family, Scenario
 from slipcar.evaluation.cli import COMMANDS, main
 from slipcar.evaluation.cli_inputs import read_controller, read_scenario
-from slipcar.planner import Feedback, OpenLoop, Plan, plan
+from slipcar.evaluation.rows import chargeable
+from slipcar.planner import Feedback, OpenLoop, Plan, Status, plan
 
 
 def test_help_teaches(capsys):
@@ -66,6 +67,7 @@ def test_help_teaches(capsys):
         (["plan", "--scenario", "random:x"], "random:SEED needs a whole number"),
         (["plan", "--scenario", "family:hard:1"], "unknown family 'hard'"),
         (["plan", "--scenario", "family:easy"], "family:NAME:SEED needs a whole number"),
+        (["simulate", "ppo", "--tiled"], "--tiled needs --video"),
         (["plan", "--scenario", "nowhere.json"], "nowhere.json"),
         (["plan", "--variance-weight", "-1"], "variance_weight must be finite and >= 0"),
         (["plan", "--save", "plan.txt"], "ends in .npz"),
@@ -241,6 +243,17 @@ def test_scenarios_by_name_seed_and_file(tmp_path):
     path = tmp_path / "mine.json"
     path.write_text(Scenario.random(3).to_json(), encoding="utf-8")
     assert read_scenario(str(path)) == Scenario.random(3)
+    assert read_scenario("family:easy:4") == Family.named("easy").sample(4)
+
+
+def test_plans_of_the_mean_are_had_where_chance_reaches_the_speed(tmp_path):
+    """The paper's penalty does not hold there; the rows and words go without it."""
+    noisy = Scenario.named("paper").replace(process_noise=(0.0, 0.0, 0.0, 0.05, 0.0))
+    assert (chargeable(Scenario.named("paper")), chargeable(noisy)) == (1.0, 0.0)
+    for word in ("scp", "feedback", "deterministic"):
+        controller, world = read_controller(word, noisy)
+        assert controller.plan.status is Status.CONVERGED
+        assert world == noisy
 
 
 def test_importing_is_light():
