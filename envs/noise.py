@@ -114,9 +114,11 @@ class Tapes:
             if rng is None:  # never seeded: from the system's entropy
                 rng = self._rngs[i] = seeding.np_random()[0]
             row = self._words[i]
-            if read < width:
+            if read == width:
+                row[:] = draw_words(rng, width)
+            else:
                 row[: width - read] = row[read:].copy()
-            row[width - read :] = draw_words(rng, read)
+                row[width - read :] = draw_words(rng, read)
         self._read[short] = 0
 
     def _widen(self, width: int) -> None:

@@ -120,7 +120,8 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         #: The step that all are at, or None where they differ.
         self._common_step: int | None = 0
         self._distance = np.full(self.num_envs, np.inf, dtype=self._dtype)
-        self._over = np.ones(self.num_envs, dtype=bool)
+        #: Those whose episode is over, or has not begun: indices.
+        self._waiting = self._everyone
         self._began = np.zeros(self.num_envs, dtype=bool)  # whether there has been an episode
         self._no_truncation = np.zeros(self.num_envs, dtype=bool)
         self._gallery: Gallery | None = None
@@ -251,7 +252,8 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                     self._start_from(source, some)
         self._step[here] = 0
         self._distance[here] = np.inf
-        self._over[here] = False
+        if len(self._waiting):
+            self._waiting = np.setdiff1d(self._waiting, here, assume_unique=True)
         self._began[here] = True
         together = len(here) == self.num_envs or bool((self._step == 0).all())
         self._common_step = 0 if together else None
@@ -298,7 +300,7 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         if not self._ready:
             raise ResetNeeded("call reset() before step()")
-        resetting = np.flatnonzero(self._over)
+        resetting = self._waiting
         if self.autoreset_mode is AutoresetMode.DISABLED and len(resetting):
             raise ResetNeeded(
                 f"sub-environments {resetting.tolist()} are over: reset them "
@@ -306,7 +308,8 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         limited = limited_action(actions, (self.num_envs,), self._dtype)
         u = np.empty((2, self.num_envs), dtype=self._dtype)
-        np.multiply(limited.T, self._worlds.action_scale, out=u)
+        for row, column, scale in zip(u, limited.T, self._worlds.action_scale, strict=True):
+            np.multiply(column, scale, out=row)
         if len(resetting):  # NEXT_STEP: this call starts their episodes and ignores the action
             self._start(resetting)
         if len(resetting) == self.num_envs:
@@ -319,14 +322,13 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 moved, observation = self._undone(resetting, begun, moved, u)
             else:
                 np.minimum(self._distance, moved.distance, out=self._distance)
-        over = self._ended(resetting)
+        over, ended = self._ended(resetting)
         goal = np.zeros(self.num_envs)
         success = np.zeros(self.num_envs, dtype=bool)
-        ended = np.flatnonzero(over)
         if len(ended):
             goal[ended] = goal_cost(self._worlds.parameters, self._x)[ended]
             success[ended] = self._arrived()[ended]
-        self._over = over.copy()  # _start writes to it
+        self._waiting = ended
         info = self._info(u, moved, goal, success)
         # In float64, so that the return is minus the sum of the costs that `info` tells of.
         reward = np.add(moved.effort, moved.obstacle, dtype=np.float64)
@@ -402,17 +404,17 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             now = self._noise.common(self._common_step)
         return now.astype(self._dtype, copy=False)
 
-    def _ended(self, resetting: np.ndarray) -> np.ndarray:
-        worlds = self._worlds
-        if self._common_step is None or worlds.shared is None:
-            over = self._step == worlds.steps
-        else:
-            over = np.full(self.num_envs, self._common_step == worlds.shared.nodes - 1)
+    def _ended(self, resetting: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whose episode is over now: as (num_envs,) of bool, and as indices."""
+        shared, k = self._worlds.shared, self._common_step
+        together = k is not None and not self.terminate_on_collision
+        if together and shared is not None and k != shared.nodes - 1:
+            return np.zeros(self.num_envs, dtype=bool), self._everyone[:0]
+        over = self._step == self._worlds.steps
         if self.terminate_on_collision:
             over |= self._distance < 0.0
-        if len(resetting):
-            over[resetting] = False
-        return over
+        over[resetting] = False
+        return over, np.flatnonzero(over)
 
     def _arrived(self) -> np.ndarray:
         worlds = self._worlds
