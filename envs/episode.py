@@ -13,8 +13,8 @@ import numpy as np
 from slipcar.envs import noise
 from slipcar.envs.car import STATE_DIM
 from slipcar.envs.families import Draw, Family
-from slipcar.envs.fleet import Source, base_of, words_for_world
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.sources import Source, base_of, words_for_world
 
 #: Words for the deviation of the start.
 _START_WORDS = (STATE_DIM + 1) // 2

@@ -21,7 +21,7 @@ import numpy as np
 
 from slipcar.envs.noise import uniforms
 from slipcar.envs.scenario import Scenario
-from slipcar.envs.validate import checked_array, checked_float, checked_int
+from slipcar.envs.validate import checked_array, checked_float, checked_int, replaced
 
 #: Seeds of :meth:`Family.held_out`: 100 worlds that stay what they are.
 HELD_OUT_SEEDS = tuple(range(100))
@@ -184,11 +184,7 @@ class Family:
         Raises:
             ValueError: for an unknown field or a bad value.
         """
-        known = [field.name for field in dataclasses.fields(self)]
-        unknown = sorted(set(changes) - set(known))
-        if unknown:
-            raise ValueError(f"a family has no field {unknown}; its fields are {known}")
-        return dataclasses.replace(self, **changes)
+        return replaced(self, "family", changes)
 
     def towards(self, other: Family, level: float) -> Family:
         """The family between this one (level 0) and `other` (level 1): a curriculum.

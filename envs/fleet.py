@@ -6,62 +6,15 @@ them. Where they differ each number is an array with one entry per car.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from slipcar.envs import car
-from slipcar.envs.families import Draw, Family
+from slipcar.envs.families import Draw
 from slipcar.envs.parameters import ABSENT, Parameters, obstacle_columns
 from slipcar.envs.scenario import Scenario
-
-#: What an environment draws its episodes' worlds from.
-Source: TypeAlias = Scenario | Family
-
-
-def source_of(value: Any) -> Source:
-    """A scenario or a family from itself, a name, JSON text or plain data.
-
-    Raises:
-        ValueError: for anything else, listing the names.
-    """
-    if isinstance(value, (Scenario, Family)):
-        return value
-    if isinstance(value, str):
-        if value.startswith("family:"):
-            return Family.named(value.removeprefix("family:"))
-        if not value.lstrip().startswith("{"):
-            return Scenario.named(value)
-        try:
-            value = json.loads(value)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"neither a scenario nor a family: no JSON ({error})") from error
-    # A family is told by its base: what a scenario must have, a start, it has not.
-    if isinstance(value, Mapping) and "base" in value and "start" not in value:
-        return Family.from_dict(value)
-    return Scenario.of(value)
-
-
-def base_of(source: Source) -> Scenario:
-    """A scenario with what all worlds of a source share."""
-    return source.base if isinstance(source, Family) else source
-
-
-def most_obstacles(source: Source) -> int:
-    """How many obstacles a world of the source may have."""
-    return source.obstacles[1] if isinstance(source, Family) else len(source.obstacles)
-
-
-def longest_horizon(source: Source) -> float:
-    """The longest horizon of a world of the source [s]."""
-    return source.horizon[1] if isinstance(source, Family) else source.horizon
-
-
-def words_for_world(source: Source) -> int:
-    """Random words that drawing a world takes."""
-    return source.words if isinstance(source, Family) else 0
+from slipcar.envs.sources import Source, base_of, most_obstacles
 
 
 class Worlds:

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from slipcar.envs.families import Family
-from slipcar.envs.fleet import Source, base_of, longest_horizon, most_obstacles
 from slipcar.envs.observation import Layout
+from slipcar.envs.sources import Source, base_of, longest_horizon, most_obstacles
 from slipcar.envs.validate import checked_array
 
 RENDER_MODES = ("rgb_array", "human")
@@ -116,6 +116,23 @@ def check_source(layout: Layout, space: Any, source: Source) -> None:
             "the observation space allows for: pass it when the environment is made"
         )
     base_of(source).action_scale  # noqa: B018  raises if unbounded
+
+
+def masked(mask: Any, count: int) -> np.ndarray:
+    """Which of `count` environments a `reset_mask` names, as indices; all for None.
+
+    Raises:
+        ValueError: unless it is a (count,) bool array with at least one True.
+    """
+    if mask is None:
+        return np.arange(count)
+    mask = np.asarray(mask)
+    if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+        raise ValueError(
+            f"reset_mask must be a bool array of shape ({count},) with at least one "
+            f"True, not {mask.dtype} of shape {mask.shape}"
+        )
+    return np.flatnonzero(mask)
 
 
 def read_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> list[Any]:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from slipcar.envs import car, cost, worlds
 from slipcar.envs.arrays import array_namespace
-from slipcar.envs.validate import checked_array, checked_float, checked_int
+from slipcar.envs.validate import checked_array, checked_float, checked_int, replaced
 
 _FORMAT = 1
 
@@ -142,11 +142,7 @@ class Scenario:
         Raises:
             ValueError: for an unknown field or a bad value.
         """
-        known = [field.name for field in dataclasses.fields(self)]
-        unknown = sorted(set(changes) - set(known))
-        if unknown:
-            raise ValueError(f"a scenario has no field {unknown}; its fields are {known}")
-        return dataclasses.replace(self, **changes)
+        return replaced(self, "scenario", changes)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain Python data, exact to the last bit."""

@@ -15,7 +15,6 @@ from slipcar.envs.arrays import FLOATS
 from slipcar.envs.car import STATE_DIM
 from slipcar.envs.cost import arrived
 from slipcar.envs.episode import draw_episode
-from slipcar.envs.fleet import base_of, longest_horizon, source_of
 from slipcar.envs.options import (
     RENDER_MODES,
     check_render_mode,
@@ -28,6 +27,7 @@ from slipcar.envs.options import (
 from slipcar.envs.overlay import Overlay
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.sources import base_of, longest_horizon, source_of
 from slipcar.envs.transition import control_from_action, goal_cost, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
 

@@ -16,11 +16,11 @@ from slipcar.envs.arrays import Functions, tensor_functions
 from slipcar.envs.car import CONTROL_DIM
 from slipcar.envs.cost import arrived
 from slipcar.envs.families import Family
-from slipcar.envs.fleet import Source, base_of, longest_horizon, source_of
 from slipcar.envs.observation import Layout
 from slipcar.envs.options import check_source, layout_for, read_options
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.sources import Source, base_of, longest_horizon, source_of
 from slipcar.envs.torch_backend import (
     checked_device,
     checked_dtype,

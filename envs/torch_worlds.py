@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slipcar.envs.families import Family
-from slipcar.envs.fleet import Worlds, base_of
+from slipcar.envs.fleet import Worlds
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.sources import base_of
 from slipcar.envs.torch_backend import tensor, torch_module
 
 if TYPE_CHECKING:

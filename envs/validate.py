@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import numbers
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 
 def checked_array(
@@ -68,6 +71,19 @@ def checked_int(name: str, value: Any, *, at_least: int, at_most: int | None = N
     if number < at_least or (at_most is not None and number > at_most):
         raise ValueError(f"{name} must be {allowed}, not {number}")
     return number
+
+
+def replaced(instance: T, kind: str, changes: dict[str, Any]) -> T:
+    """A copy of a dataclass with some fields changed, validated again.
+
+    Raises:
+        ValueError: for an unknown field or a bad value.
+    """
+    known = [field.name for field in dataclasses.fields(instance)]  # type: ignore[arg-type]
+    unknown = sorted(set(changes) - set(known))
+    if unknown:
+        raise ValueError(f"a {kind} has no field {unknown}; its fields are {known}")
+    return dataclasses.replace(instance, **changes)  # type: ignore[type-var]
 
 
 def _check_range(name: str, array: np.ndarray, at_least: float | None, above: float | None) -> None:

@@ -19,7 +19,7 @@ from slipcar.envs.arrays import ARRAYS
 from slipcar.envs.car import NOISE_DIM, STATE_DIM
 from slipcar.envs.cost import arrived
 from slipcar.envs.episode import read_episodes, words_for_episode
-from slipcar.envs.fleet import Source, Worlds, base_of, longest_horizon, source_of
+from slipcar.envs.fleet import Worlds
 from slipcar.envs.noise import Tapes, generators
 from slipcar.envs.noise_store import NoiseStore
 from slipcar.envs.options import (
@@ -31,12 +31,14 @@ from slipcar.envs.options import (
     checked_start,
     dtype_of,
     layout_for,
+    masked,
     read_options,
 )
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.pictures.gallery import Gallery
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.slip_car import RENDER_FPS
+from slipcar.envs.sources import Source, base_of, chosen, longest_horizon, source_of
 from slipcar.envs.transition import Moved, goal_cost, limited_action, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
 from slipcar.envs.vector_info import info_at_start, restarted, step_info
@@ -182,9 +184,13 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         known = ("reset_mask", "scenario", "start", "noise")
         mask, given, start, noise = read_options(options, known)
         # All that can be wrong is found before anything is changed.
-        here = self._masked(mask)
+        here = masked(mask, self.num_envs)
         rngs = generators(seed, self.num_envs)
-        sources = self._sources_with(here, given)
+        sources = self._sources, self._source_of
+        if given is not None:
+            sources = chosen(*sources, here, given)
+            for source in sources[0]:
+                check_source(self.layout, self.single_observation_space, source)
         if start is not None:
             start = checked_start(start, (self.num_envs, STATE_DIM))
         reached = sorted({i for s in sources[0] for i, _ in base_of(s).process})
@@ -207,39 +213,6 @@ class SlipCarVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         started[here] = True
         self._record(here, moved=False)
         return observation, self._info_at_start(distance, started)
-
-    def _masked(self, mask: Any) -> np.ndarray:
-        if mask is None:
-            return self._everyone
-        mask = np.asarray(mask)
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ValueError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},) with at least one "
-                f"True, not {mask.dtype} of shape {mask.shape}"
-            )
-        return np.flatnonzero(mask)
-
-    def _sources_with(self, here: np.ndarray, given: Any) -> tuple[list[Source], np.ndarray]:
-        """What there is to draw from, and who does, once `here` are given the option `scenario`."""
-        if given is None:
-            return self._sources, self._source_of
-        if isinstance(given, (list, tuple)):
-            if len(given) != self.num_envs:
-                raise ValueError(
-                    f"scenario must be one or a list of {self.num_envs}, not of {len(given)}"
-                )
-            named = {id(value): source_of(value) for value in given}
-            new = [named[id(value)] for value in given]
-        else:
-            new = [source_of(given)] * self.num_envs
-        chosen = [self._sources[s] for s in self._source_of]
-        for i in here:
-            chosen[i] = new[i]
-        number: dict[Source, int] = {}
-        which = np.array([number.setdefault(source, len(number)) for source in chosen])
-        for source in number:
-            check_source(self.layout, self.single_observation_space, source)
-        return list(number), which
 
     def _start(self, here: np.ndarray) -> None:
         """New episodes in the sub-environments `here` (indices)."""
