@@ -5,9 +5,9 @@
     goal     = (x_N − x^f)ᵀ W (x_N − x^f)
     collision: ‖r_k − r_o‖ < δ_o at any node k = 1..N−1
 
-`ring_depth`, `rim_distance`, `hinge_cost` and `weighted_square` are these formulas, on components
-(:mod:`slipcar.envs.arrays`). The other functions put them into arrays, batched over leading
-axes, for NumPy and Torch. Obstacles are rows (x, y, radius) [m].
+`squared_norm`, `ring_depth`, `rim_distance`, `hinge_cost` and `weighted_square` are these formulas,
+on components (:mod:`slipcar.envs.arrays`). The other functions put them into arrays, batched over
+leading axes, for NumPy and Torch. Obstacles are rows (x, y, radius) [m].
 """
 
 from __future__ import annotations
@@ -41,6 +41,14 @@ def weighted_square(errors: Any, weights: Any) -> Any:
     return total
 
 
+def squared_norm(u: Any) -> Any:
+    """‖u‖² of components."""
+    total = u[0] * u[0]
+    for component in u[1:]:
+        total = total + component * component
+    return total
+
+
 def arrived(x: Any, goal: Any, tolerance: Any) -> Any:
     """Whether |x_i − x^f_i| ≤ tolerance_i for all components."""
     within: Any = True
@@ -51,8 +59,7 @@ def arrived(x: Any, goal: Any, tolerance: Any) -> Any:
 
 def control_power(u: Any) -> Any:
     """G(u) = ‖u‖², (..., m) -> (...,): the effort per second."""
-    xp = array_namespace(u)
-    return xp.sum(u * u, axis=-1)
+    return squared_norm([u[..., i] for i in range(u.shape[-1])])
 
 
 def squared_distances(x: Any, obstacles: Any) -> Any:

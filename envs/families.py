@@ -21,7 +21,7 @@ import numpy as np
 
 from slipcar.envs.noise import uniforms
 from slipcar.envs.scenario import Scenario
-from slipcar.envs.validate import checked_array, checked_float, checked_int, replaced
+from slipcar.envs.validate import checked_array, checked_float, checked_int, parsed_object, replaced
 
 #: Seeds of :meth:`Family.held_out`: 100 worlds that stay what they are.
 HELD_OUT_SEEDS = tuple(range(100))
@@ -244,13 +244,7 @@ class Family:
             ValueError: if the text is no JSON object, has unknown fields, or a value is out of
                 range.
         """
-        try:
-            data = json.loads(text)
-        except (json.JSONDecodeError, TypeError) as error:
-            raise ValueError(f"not a family: the text is not JSON ({error})") from error
-        if not isinstance(data, Mapping):
-            raise ValueError(f"not a family: expected a JSON object, not {type(data).__name__}")
-        return cls.from_dict(data)
+        return cls.from_dict(parsed_object(text, "family"))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Family:

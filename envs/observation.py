@@ -35,7 +35,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
-from slipcar.envs.arrays import ARRAYS, FLOATS, Functions, array_namespace
+from slipcar.envs.arrays import ARRAYS, FLOATS, Functions, array_namespace, functions_of
 from slipcar.envs.nearest import nearest
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.validate import checked_int
@@ -176,8 +176,7 @@ def entries(
     to_go = p.horizon - t
     rate = 1.0 / (max(to_go, p.dt) if isinstance(to_go, float) else _at_least(to_go, p.dt))
     # The last node's time may be rounded to a little after the horizon.
-    fraction = 2.0 * t / p.horizon - 1.0
-    fraction = min(fraction, 1.0) if isinstance(fraction, float) else clip(fraction, -1.0, 1.0)
+    fraction = _limited(2.0 * t / p.horizon - 1.0, -1.0, 1.0)
     seen = [
         *functions.bounded([dx / _POSITION_SCALE, dy / _POSITION_SCALE], _WIDE),
         cos,
@@ -191,7 +190,7 @@ def entries(
             to_go / _TIME_SCALE,
             *(s / scale for s, scale in zip(p.slip, _SLIP_SCALE, strict=True)),
         )
-        seen += [_limited(value, functions) for value in rest]
+        seen += [_limited(value, 0.0, _WIDE) for value in rest]
     shown, block = _obstacles(layout, p, x, rims, functions, frame)
     return seen + shown, block
 
@@ -309,11 +308,9 @@ def _turned(frame: tuple[Any, Any], dx: Any, dy: Any) -> tuple[Any, Any]:
     return cos * dx + sin * dy, cos * dy - sin * dx
 
 
-def _limited(value: Any, functions: Functions) -> Any:
-    """Limited to [0, _WIDE], whether one for all cars or one for each."""
-    if isinstance(value, float):
-        return min(max(value, 0.0), _WIDE)
-    return functions.clip(value, 0.0, _WIDE)
+def _limited(value: Any, low: float, high: float) -> Any:
+    """The value limited to a range, whether one for all cars or one for each."""
+    return functions_of(value).clip(value, low, high)
 
 
 def _at_least(values: Any, low: Any) -> Any:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from slipcar.envs import car, cost, worlds
 from slipcar.envs.arrays import array_namespace
-from slipcar.envs.validate import checked_array, checked_float, checked_int, replaced
+from slipcar.envs.validate import checked_array, checked_float, checked_int, parsed_object, replaced
 
 _FORMAT = 1
 
@@ -164,13 +164,7 @@ class Scenario:
             ValueError: if the text is no JSON object, has unknown or missing fields, or a
                 value is out of range.
         """
-        try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"not a scenario: the text is not JSON ({error})") from error
-        if not isinstance(data, dict):
-            raise ValueError(f"not a scenario: expected a JSON object, not {type(data).__name__}")
-        return cls.from_dict(data)
+        return cls.from_dict(parsed_object(text, "scenario"))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Scenario:

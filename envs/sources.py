@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.validate import parsed_object
 
 #: What an environment draws its episodes' worlds from.
 Source: TypeAlias = Scenario | Family
@@ -28,10 +28,7 @@ def source_of(value: Any) -> Source:
             return Family.named(value.removeprefix("family:"))
         if not value.lstrip().startswith("{"):
             return Scenario.named(value)
-        try:
-            value = json.loads(value)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"neither a scenario nor a family: no JSON ({error})") from error
+        value = parsed_object(value, "scenario or family")
     # A family is told by its base: what a scenario must have, a start, it has not.
     if isinstance(value, Mapping) and "base" in value and "start" not in value:
         return Family.from_dict(value)

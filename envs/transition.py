@@ -64,7 +64,7 @@ def step(
     for variates in noise:
         x = add(x, increments(x, u, h, root, variates, p.slip, p.process, functions))
     power, distance, rims = proximity(p, x, functions)
-    return Moved(x, p.dt * (u[0] * u[0] + u[1] * u[1]), p.dt * power, distance, rims)
+    return Moved(x, p.dt * cost.squared_norm(u), p.dt * power, distance, rims)
 
 
 def proximity(p: Parameters, x: Components, functions: Functions) -> tuple[Any, Any, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import numbers
 from typing import Any, TypeVar
 
@@ -71,6 +72,21 @@ def checked_int(name: str, value: Any, *, at_least: int, at_most: int | None = N
     if number < at_least or (at_most is not None and number > at_most):
         raise ValueError(f"{name} must be {allowed}, not {number}")
     return number
+
+
+def parsed_object(text: Any, kind: str) -> dict[str, Any]:
+    """The object that JSON text describes.
+
+    Raises:
+        ValueError: if it is no text, no JSON, or no object.
+    """
+    try:
+        data = json.loads(text)
+    except (json.JSONDecodeError, TypeError) as error:
+        raise ValueError(f"not a {kind}: the text is not JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"not a {kind}: expected a JSON object, not {type(data).__name__}")
+    return data
 
 
 def replaced(instance: T, kind: str, changes: dict[str, Any]) -> T:
