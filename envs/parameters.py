@@ -55,9 +55,16 @@ class Parameters(NamedTuple):
     @staticmethod
     def like(component: Any, scenario: Scenario) -> Parameters:
         """Those of one scenario, for components of this kind and shape."""
+        row = isinstance(component, np.ndarray) and component.ndim == 1
+        if row and component.dtype == np.float64:
+            return scenario.row_parameters  # an evaluation asks for them at every step
         p = Parameters.of(scenario)
         if isinstance(component, float):
             return p
+        return p.shaped(component, scenario)
+
+    def shaped(self, component: Any, scenario: Scenario) -> Parameters:
+        """The same with obstacles as columns beside arrays of this kind and shape."""
         xp = array_namespace(component)
         columns = xp.asarray(
             obstacle_columns(scenario.obstacles, scenario.clearance),
@@ -65,7 +72,7 @@ class Parameters(NamedTuple):
             device=device(component),
         )
         shape = (len(columns), -1, *(1 for _ in component.shape))
-        return p._replace(obstacles=tuple(xp.reshape(columns, shape)))
+        return self._replace(obstacles=tuple(xp.reshape(columns, shape)))
 
 
 def obstacle_columns(obstacles: np.ndarray, clearance: float) -> np.ndarray:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from slipcar.envs import car, cost, worlds
 from slipcar.envs.arrays import array_namespace
+from slipcar.envs.parameters import Parameters
 from slipcar.envs.validate import checked_array, checked_float, checked_int, parsed_object, replaced
 
 _FORMAT = 1
@@ -284,6 +285,11 @@ class Scenario:
     def noise_dim(self) -> int:
         """Brownian motions that drive the car, 3 + p: three of the slip, then the process noise."""
         return car.NOISE_DIM + len(self.process)
+
+    @functools.cached_property
+    def row_parameters(self) -> Parameters:
+        """The numbers of a step, for components that are rows of float64."""
+        return Parameters.of(self).shaped(np.empty(0), self)
 
     @functools.cached_property
     def start_covariance(self) -> np.ndarray:

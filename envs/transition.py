@@ -119,10 +119,17 @@ class Transition:
     distance: Any
 
 
-def transition(scenario: Scenario, x: Any, u: Any, noise: Any) -> Transition:
+def transition(
+    scenario: Scenario,
+    x: Any,
+    u: Any,
+    noise: Any,
+    add: Callable[[Components, Components], Components] = added_up,
+) -> Transition:
     """Advance states x (..., 5) under controls u (..., 2) with noise (..., substeps, 3 + p).
 
-    NumPy and Torch; p is the number of states that the scenario's process noise reaches.
+    NumPy and Torch; p is the number of states that the scenario's process noise reaches. `add` is
+    that of :func:`step`: it is called with the state before every substep.
     """
     xp = array_namespace(x, u, noise)
     components = [x[..., i] for i in range(car.STATE_DIM)]
@@ -130,7 +137,8 @@ def transition(scenario: Scenario, x: Any, u: Any, noise: Any) -> Transition:
     substeps, motions = noise.shape[-2:]
     variates = [[noise[..., j, i] for i in range(motions)] for j in range(substeps)]
     functions = functions_of(components[0])
-    moved = step(Parameters.like(x[..., 0], scenario), components, controls, variates, functions)
+    p = Parameters.like(x[..., 0], scenario)
+    moved = step(p, components, controls, variates, functions, add)
     return Transition(
         state=together(xp, moved.state),
         effort=moved.effort,

@@ -8,9 +8,10 @@ The command line `slipcar compare|frontier|plan|simulate|train|dataset` is
 :mod:`slipcar.evaluation.cli`.
 """
 
-from slipcar.evaluation.compare import Comparison, compare, evaluate
+from slipcar.evaluation.compare import Comparison, compare
+from slipcar.evaluation.controller import Controller
 from slipcar.evaluation.metrics import EpisodeMetrics, Result
-from slipcar.evaluation.rollout import Controller, rollout, sample_paths
+from slipcar.evaluation.rollout import evaluate, sample_paths
 
 __all__ = [
     "Comparison",
@@ -19,6 +20,5 @@ __all__ = [
     "Result",
     "compare",
     "evaluate",
-    "rollout",
     "sample_paths",
 ]

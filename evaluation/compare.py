@@ -1,189 +1,207 @@
-"""`evaluate` one controller, `compare` many over the same Brownian paths (SPEC §7)."""
+"""`compare` many controllers over the same Brownian paths (SPEC §7)."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.validate import checked_float
+from slipcar.evaluation.cells import Store
+from slipcar.evaluation.controller import Controller, check_controller
+from slipcar.evaluation.executors import open_executor
 from slipcar.evaluation.metrics import Result
+from slipcar.evaluation.noise import BLOCK
+from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
-from slipcar.evaluation.rollout import Controller, check_controller, check_counts, rollout
-from slipcar.evaluation.statistics import paired_difference
-from slipcar.evaluation.store import load_row, row_key, save_row
+from slipcar.evaluation.rollout import check_counts, evaluate
+from slipcar.evaluation.runs import Runs
+from slipcar.evaluation.statistics import episodes_for, half_width
+from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, sweep
 
 if TYPE_CHECKING:
     import pandas as pd
 
+__all__ = ["Comparison", "compare", "evaluate"]
+
 #: Per-episode metrics whose paired differences against the reference row are shown.
-DIFFERENCES = {"total_difference": "total", "collision_difference": "collision"}
-
-
-def evaluate(
-    controller: Controller,
-    scenario: Scenario | str,
-    episodes: int = 10_000,
-    seed: int = 0,
-    *,
-    substeps: int = 1,
-    batch_size: int | None = None,
-    n_jobs: int = 1,
-    progress: Callable[[int], None] | None = None,
-) -> Result:
-    """Drive many episodes and say what came of them.
-
-    Example:
-        >>> from slipcar.evaluation import evaluate
-        >>> from slipcar.planner import OpenLoop, plan
-        >>> r = evaluate(OpenLoop(plan(scenario)), scenario, episodes=10_000, seed=0)
-        >>> r.collision_rate, r.collision_interval, r.total, r.total_se
-
-    Args:
-        controller: any object with the `predict` of Stable-Baselines3; see
-            :class:`slipcar.evaluation.rollout.Controller` for what else it may offer.
-        scenario: a scenario or the name of one.
-        episodes: how many, >= 1.
-        seed: of the Brownian paths, >= 0; episode i depends on (seed, i) alone.
-        substeps: Euler–Maruyama steps in each control interval.
-        batch_size: episodes in one task of a worker; the numbers do not depend on it.
-        n_jobs: worker processes; the numbers do not depend on it.
-        progress: called with the number of episodes finished since the last call.
-
-    Raises:
-        ValueError: for a bad argument, or a bad action, naming controller, step and episode.
-    """
-    began = time.perf_counter()
-    done = rollout(
-        controller,
-        scenario,
-        episodes,
-        seed,
-        substeps=substeps,
-        batch_size=batch_size,
-        n_jobs=n_jobs,
-        progress=progress,
-    )
-    preparation = getattr(controller, "preparation_time", None)
-    return Result(
-        metrics=done.metrics,
-        seed=seed,
-        substeps=substeps,
-        closed_loop=bool(getattr(controller, "closed_loop", True)),
-        failures=solver_failures(controller) if done.failures is None else done.failures,
-        inference_time=done.inference_time,
-        preparation_time=float("nan") if preparation is None else float(preparation),
-        wall_time=time.perf_counter() - began,
-    )
-
-
-def solver_failures(controller: Controller) -> int:
-    """Solves behind a controller that failed: its `failures`, else 1 for an unconverged plan."""
-    counted = getattr(controller, "failures", None)
-    if counted is not None:
-        return int(counted)
-    status = getattr(getattr(controller, "plan", None), "status", None)
-    return int(status is not None and not status.ok)
+DIFFERENCES = {
+    "total_difference": "total",
+    "collision_difference": "collision",
+    "between_difference": "touched",
+}
+#: Episodes from which a resolution is turned into a number of episodes, and the most it may ask.
+PILOT, MOST = 8 * BLOCK, 4096 * BLOCK
 
 
 def compare(
-    controllers: Mapping[str, Controller],
+    controllers: Mapping[str, Controller | Runs],
     scenario: Scenario | str,
-    episodes: int = 10_000,
+    episodes: int | None = None,
     seed: int = 0,
     *,
     reference: str | None = None,
+    resolution: float | None = None,
     substeps: int = 1,
-    batch_size: int | None = None,
     n_jobs: int = 1,
+    cluster: str | None = None,
     folder: str | Path | None = None,
     resume: bool = True,
+    time_limit: float | None = TIME_LIMIT,
     progress: bool = True,
 ) -> Comparison:
     """Evaluate every controller over the same Brownian paths.
 
     A controller that raises becomes a row with its message in `errors`; the others go on. With
-    a `folder`, each finished row is written there at once, so that an interrupted comparison
-    continues where it stopped; only the same scenario, seed, episodes, controller and code
-    count as the same row.
+    a `folder`, work is written there as it is finished, some thousand episodes at a time, so that
+    an interrupted comparison continues where it stopped; only what has the same scenario, seed,
+    controller, code and versions counts as the same. The numbers depend on neither the workers
+    nor the cluster, to the last bit.
 
     Args:
-        controllers: name -> controller, in the order of the table.
+        controllers: name -> controller, or :class:`slipcar.evaluation.runs.Runs` for a learned
+            method with several trainings; in the order of the table.
         scenario: a scenario or the name of one.
-        episodes: a row, >= 1.
+        episodes: a row, >= 1; None is 10 000, or what `resolution` needs.
         seed: of the Brownian paths, >= 0.
         reference: the row that paired differences are taken against; None takes the first whose
             name contains "SCP", else the first.
+        resolution: half width that the 95 % intervals of the collision rates are to have, such as
+            0.001. Without `episodes`, each row drives as many as its own rate needs, judged from
+            its first 8192; with them, rows whose interval is wider are named in `warnings`.
         substeps: Euler–Maruyama steps in each control interval.
-        batch_size: episodes in one task of a worker; the numbers do not depend on it.
-        n_jobs: worker processes; the numbers do not depend on it.
-        folder: where finished rows are kept; None keeps them in memory alone.
-        resume: whether to reuse finished rows of `folder`.
+        n_jobs: worker processes on this machine.
+        cluster: None, or a Dask cluster: see :func:`slipcar.evaluation.executors.open_executor`.
+        folder: where finished work is kept; None keeps it in memory alone.
+        resume: whether to reuse finished work of `folder`.
+        time_limit: seconds that a row may take for 1024 episodes before it counts as failed; None
+            is no limit.
         progress: whether to show a bar for each row.
 
     Raises:
         ValueError: for a bad argument, before anything is run.
+        OSError: if the cluster does not answer.
+        LostWorkersError: if the cluster is gone; finished work is kept.
     """
     scenario = Scenario.of(scenario)
-    check_counts(episodes, seed, substeps, batch_size, n_jobs)
+    if resolution is not None:
+        episodes_for(resolution, 0.0)  # raises now if it is out of range
+    fixed = episodes if episodes is not None else None if resolution is not None else 10_000
+    check_counts(PILOT if fixed is None else fixed, seed, substeps, None, n_jobs)
+    if time_limit is not None:
+        checked_float("time_limit", time_limit, above=0.0)
     if not controllers:
         raise ValueError("compare needs at least one controller, not an empty mapping")
     for name, controller in controllers.items():
         if not isinstance(name, str) or not name.strip():
             raise ValueError(f"a row's name must be a non-empty string, not {name!r}")
-        check_controller(controller)
+        if not isinstance(controller, Runs):
+            check_controller(controller)
     chosen = _reference(list(controllers), reference)
     began = time.perf_counter()
-    results: dict[str, Result] = {}
-    errors: dict[str, str] = {}
-    reused: list[str] = []
-    with _Progress(progress, episodes, max(map(len, controllers))) as show:
-        for name, controller in controllers.items():
-            key = None
-            if folder is not None:
-                key = row_key(controller, scenario, episodes, seed, substeps)
-            stored = None
-            if folder is not None and key is not None and resume:
-                stored = load_row(folder, name, key)
-            if stored is not None:
-                results[name] = stored
-                reused.append(name)
-                show.row(name, "stored")(episodes)
-                continue
-            try:
-                results[name] = evaluate(
-                    controller,
-                    scenario,
-                    episodes,
-                    seed,
-                    substeps=substeps,
-                    batch_size=batch_size,
-                    n_jobs=n_jobs,
-                    progress=show.row(name),
-                )
-            except Exception as error:  # one bad row must not cost the others
-                notes = getattr(error, "__notes__", [])
-                errors[name] = "; ".join([f"{type(error).__name__}: {error}", *notes])
-                show.note("failed")
-                continue
-            if folder is not None and key is not None:
-                save_row(folder, name, key, results[name])
+    store = Store(folder, resume)
+    counts = dict.fromkeys(controllers, PILOT if fixed is None else fixed)
+    trained = {name: len(_trainings(controller)) for name, controller in controllers.items()}
+
+    def jobs() -> list[Job]:
+        return [
+            Job(name, label, one, scenario, counts[name], seed, substeps, time_limit)
+            for name, controller in controllers.items()
+            for label, one in _trainings(controller).items()
+        ]
+
+    def expected() -> dict[str, int]:
+        return {name: counts[name] * trained[name] for name in controllers}
+
+    with open_executor(n_jobs, cluster) as executor:
+        with Bars(expected(), progress) as bars:
+            swept = sweep(jobs(), store, executor, bars)
+        results, errors = _rows(controllers, swept)
+        if fixed is None and resolution is not None:
+            counts |= {name: needed(resolution, row) for name, row in results.items()}
+            with Bars(expected(), progress) as bars:
+                swept = sweep(jobs(), store, executor, bars)
+            results, errors = _rows(controllers, swept)
+    warnings = [store.trouble] if store.trouble else []
+    if resolution is not None:
+        warnings += _too_wide(results, resolution)
+    reused = {
+        name
+        for name in results
+        if all((name, v) in swept.reused for v in _trainings(controllers[name]))
+    }
+    if folder is not None and resume and swept.computed and (others := store.foreign()):
+        warnings.append(
+            f"{others} finished cells in {store.folder} belong to other options or another version "
+            "and were not used; they may be deleted"
+        )
     return Comparison(
         scenario=scenario,
-        episodes=episodes,
+        episodes=max((row.episodes for row in results.values()), default=max(counts.values())),
         seed=seed,
         substeps=substeps,
         reference=chosen,
         controllers=dict(controllers),
         results=results,
         errors=errors,
-        reused=tuple(reused),
+        reused=tuple(name for name in controllers if name in reused),
+        warnings=tuple(warnings),
         wall_time=time.perf_counter() - began,
         provenance=provenance(),
     )
+
+
+def needed(resolution: float, row: Result) -> int:
+    """Episodes for a row whose interval is to be at most ± `resolution`, in whole blocks.
+
+    The rate is taken to be at the far end of the interval that the pilot left of it.
+    """
+    low, high = row.collision_interval
+    rate = 0.5 if low < 0.5 < high else high if high <= 0.5 else low
+    return min(MOST, max(PILOT, -(-episodes_for(resolution, rate) // BLOCK) * BLOCK))
+
+
+def _trainings(controller: Controller | Runs) -> dict[str, Controller]:
+    """Label -> controller of everything behind a row."""
+    if isinstance(controller, Runs):
+        return dict(zip(controller.labels, controller.controllers, strict=True))
+    return {"": controller}
+
+
+def _rows(
+    controllers: Mapping[str, Controller | Runs], swept: Swept
+) -> tuple[dict[str, Result], dict[str, str]]:
+    """Results and errors by row; a row of several trainings fails with any of them."""
+    results: dict[str, Result] = {}
+    errors: dict[str, str] = {}
+    for name, controller in controllers.items():
+        labels = _trainings(controller)
+        failed = [swept.errors[name, label] for label in labels if (name, label) in swept.errors]
+        if failed:
+            errors[name] = failed[0]
+            continue
+        parts = [swept.results[name, label] for label in labels]
+        results[name] = Result.of_runs(parts) if isinstance(controller, Runs) else parts[0]
+    return results, errors
+
+
+def _too_wide(results: dict[str, Result], resolution: float) -> list[str]:
+    """A warning for each row that cannot tell rates apart as finely as was asked for."""
+    found = []
+    for name, row in results.items():
+        half = half_width(row.collision_rate, row.episodes)
+        if half > resolution:
+            more = needed(resolution, row)
+            found.append(
+                f"{name}: its collision rate is known to ± {100 * half:.2g} %, not to the "
+                f"± {100 * resolution:g} % asked for"
+                + (f"; {more:,} episodes would do" if more < MOST else "; too fine to be had")
+            )
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +210,7 @@ class Comparison:
 
     Attributes:
         scenario: the world.
-        episodes: a row.
+        episodes: a row; the most, where they differ.
         seed: of the Brownian paths.
         substeps: Euler–Maruyama steps in each control interval.
         reference: name of the row that differences are taken against.
@@ -200,6 +218,7 @@ class Comparison:
         results: name -> result, of the rows that finished.
         errors: name -> message, of the rows that raised.
         reused: names of the rows that were read from the folder.
+        warnings: what a reader must be told: intervals too wide, work that could not be kept.
         wall_time: seconds the comparison took.
         provenance: versions, machine, date, commit.
     """
@@ -209,10 +228,11 @@ class Comparison:
     seed: int
     substeps: int
     reference: str
-    controllers: dict[str, Controller]
+    controllers: dict[str, Controller | Runs]
     results: dict[str, Result]
     errors: dict[str, str]
     reused: tuple[str, ...]
+    warnings: tuple[str, ...]
     wall_time: float
     provenance: dict[str, Any]
 
@@ -235,12 +255,10 @@ class Comparison:
     def _differences(self, name: str) -> dict[str, float]:
         found: dict[str, float] = {}
         for label, metric in DIFFERENCES.items():
-            low = mean = high = float("nan")
+            mean = low = high = float("nan")
             if name != self.reference and self.reference in self.results:
-                mean, low, high = paired_difference(
-                    getattr(self.results[name].metrics, metric),
-                    getattr(self.results[self.reference].metrics, metric),
-                )
+                reference = self.results[self.reference]
+                mean, low, high = self.results[name].difference(reference, metric)
             found.update({label: mean, f"{label}_low": low, f"{label}_high": high})
         return found
 
@@ -287,45 +305,3 @@ def _reference(names: list[str], wanted: str | None) -> str:
     if wanted not in names:
         raise ValueError(f"unknown reference {wanted!r}; the rows are {names}")
     return wanted
-
-
-class _Progress:
-    """A bar for each row, or nothing."""
-
-    def __init__(self, shown: bool, episodes: int, width: int) -> None:
-        self.episodes = episodes
-        self.width = width
-        self.bars: Any = None
-        if shown:
-            from rich import progress
-            from rich.console import Console
-
-            self.bars = progress.Progress(
-                progress.TextColumn("{task.description}"),
-                progress.BarColumn(),
-                progress.TextColumn("{task.completed:,.0f} of {task.total:,.0f} episodes"),
-                progress.TimeElapsedColumn(),
-                progress.TextColumn("{task.fields[note]}"),
-                console=Console(stderr=True),
-            )
-
-    def __enter__(self) -> _Progress:
-        if self.bars is not None:
-            self.bars.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self.bars is not None:
-            self.bars.stop()
-
-    def row(self, name: str, note: str = "") -> Callable[[int], None]:
-        """What to call with the episodes finished since the last call."""
-        if self.bars is None:
-            return lambda episodes: None
-        self.task = self.bars.add_task(name.ljust(self.width), total=self.episodes, note=note)
-        return lambda episodes: self.bars.advance(self.task, episodes)
-
-    def note(self, text: str) -> None:
-        """Say something beside the current row's bar."""
-        if self.bars is not None:
-            self.bars.update(self.task, note=text)

@@ -29,11 +29,11 @@ import numpy as np
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.scenario import Scenario
-from slipcar.evaluation.compare import solver_failures
+from slipcar.evaluation.cells import controller_fingerprint
+from slipcar.evaluation.controller import Controller, controller_name
 from slipcar.evaluation.episodes import Episodes, record
 from slipcar.evaluation.provenance import provenance
-from slipcar.evaluation.rollout import Controller, controller_name
-from slipcar.evaluation.store import controller_fingerprint
+from slipcar.evaluation.rollout import solver_failures
 
 ENVIRONMENT = "slipcar.envs:SlipCar-v0"
 #: Episodes written at a time, so that a progress bar moves.

@@ -21,14 +21,10 @@ from slipcar.envs.observation import Layout
 from slipcar.envs.options import layout_for
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import checked_float, checked_int
+from slipcar.evaluation.controller import Controller, check_controller, controller_name
 from slipcar.evaluation.noise import BLOCK
-from slipcar.evaluation.rollout import (
-    Controller,
-    check_controller,
-    controller_name,
-    one_thread,
-    play,
-)
+from slipcar.evaluation.rollout import play
+from slipcar.evaluation.threads import one_thread
 
 #: Keeps exploration apart from the Brownian paths, which have the entropy (seed, block).
 _EXPLORATION = 0x0DA7A

@@ -9,10 +9,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from slipcar.envs.scenario import Scenario
-from slipcar.evaluation.statistics import standard_error, wilson_interval
+from slipcar.evaluation.statistics import (
+    Interval,
+    cvar,
+    paired_difference,
+    quantile,
+    rate_interval,
+    standard_error,
+    student_interval,
+)
 
-#: Quantiles of the clearance that tables show.
+#: Quantiles that tables show: of the clearance, and of a path's cost.
 CLEARANCE_QUANTILES = (0.01, 0.05, 0.5)
+COST_QUANTILES = (0.5, 0.95, 0.99)
+#: Share of the worst episodes that a conditional value at risk averages.
+TAIL = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +36,8 @@ class EpisodeMetrics:
         goal: (x_N − x^f)ᵀ W (x_N − x^f).
         collision: whether any node 1..N−1 lay inside a bare radius.
         clearance: smallest signed distance to a rim over nodes 1..N−1 [m]; inf without obstacles.
+        touched: probability of a collision at a node or between nodes, given the path's nodes
+            (:mod:`slipcar.evaluation.between`); 1 where `collision`.
         position_error: ‖r_N − r^f‖ [m].
         heading_error: |θ_N − θ^f| [rad], unwrapped, as the goal cost has it.
         speed_error: |v_N − v^f| [m/s].
@@ -35,6 +48,7 @@ class EpisodeMetrics:
     goal: np.ndarray
     collision: np.ndarray
     clearance: np.ndarray
+    touched: np.ndarray
     position_error: np.ndarray
     heading_error: np.ndarray
     speed_error: np.ndarray
@@ -54,16 +68,22 @@ class EpisodeMetrics:
         effort: np.ndarray,
         obstacle: np.ndarray,
         clearance: np.ndarray,
+        log_clear: np.ndarray,
         final: np.ndarray,
     ) -> EpisodeMetrics:
-        """From the sums over a path and its last state (episodes, 5)."""
+        """From the sums over a path and its last state (episodes, 5).
+
+        `log_clear` sums :func:`slipcar.evaluation.between.log_clear` over the intervals.
+        """
         error = scenario.terminal(final)
+        collision = clearance < 0.0
         return cls(
             effort=effort,
             obstacle=obstacle,
             goal=scenario.goal_cost(final),
-            collision=clearance < 0.0,
+            collision=collision,
             clearance=clearance,
+            touched=np.where(collision, 1.0, -np.expm1(log_clear)),
             position_error=np.hypot(error[..., 0], error[..., 1]),
             heading_error=np.abs(error[..., 2]),
             speed_error=np.abs(error[..., 3]),
@@ -90,11 +110,13 @@ FIELDS = tuple(field.name for field in dataclasses.fields(EpisodeMetrics))
 class Result:
     """What a controller did over many episodes; what :func:`slipcar.evaluation.evaluate` returns.
 
-    Means come with standard errors (`total`, `total_se`), the collision rate with its Wilson
-    95 % interval. The per-episode arrays are in `metrics`.
+    Means come with standard errors (`total`, `total_se`), rates with 95 % intervals. A learned
+    method may have been trained several times (`runs`): then means are over runs and paths, and
+    errors and intervals are of the method, trainings and paths together.
 
     Attributes:
-        metrics: per-episode arrays; row i depends on (seed, i) alone.
+        metrics: per-episode arrays; row i depends on (seed, i) alone. With several runs, one
+            run's episodes after the other's.
         seed: of the Brownian paths.
         substeps: Euler–Maruyama steps in each control interval.
         closed_loop: whether the controller looks at the state.
@@ -102,6 +124,7 @@ class Result:
         inference_time: seconds inside `predict` per step and episode.
         preparation_time: seconds of planning or training before; nan when unknown.
         wall_time: seconds this evaluation took.
+        runs: what each of several trainings did over the same paths; empty for a single controller.
     """
 
     metrics: EpisodeMetrics
@@ -112,11 +135,57 @@ class Result:
     inference_time: float
     preparation_time: float
     wall_time: float
+    runs: tuple[Result, ...] = ()
+
+    @classmethod
+    def of_runs(cls, runs: Sequence[Result]) -> Result:
+        """One row for several trainings of a method, all over the same paths."""
+        first = runs[0]
+        return cls(
+            metrics=EpisodeMetrics.concatenate([run.metrics for run in runs]),
+            seed=first.seed,
+            substeps=first.substeps,
+            closed_loop=first.closed_loop,
+            failures=sum(run.failures for run in runs),
+            inference_time=float(np.mean([run.inference_time for run in runs])),
+            preparation_time=float(np.mean([run.preparation_time for run in runs])),
+            wall_time=sum(run.wall_time for run in runs),
+            runs=tuple(runs),
+        )
 
     @property
     def episodes(self) -> int:
-        """How many episodes."""
-        return len(self.metrics)
+        """How many episodes, of each run."""
+        return len(self.metrics) // max(1, len(self.runs))
+
+    def per_path(self, metric: str) -> np.ndarray:
+        """A metric of each path, averaged over the runs, (episodes,) float64."""
+        values = np.asarray(getattr(self.metrics, metric), dtype=np.float64)
+        return values.reshape(-1, self.episodes).mean(axis=0) if self.runs else values
+
+    def per_run(self, metric: str, episodes: int | None = None) -> np.ndarray:
+        """Each run's mean of a metric over its first `episodes` (None: all), (runs,)."""
+        values = np.asarray(getattr(self.metrics, metric), dtype=np.float64)
+        return values.reshape(-1, self.episodes)[:, :episodes].mean(axis=1)
+
+    def spread(self, metric: str) -> float:
+        """Standard deviation between the runs' means; nan for a single controller."""
+        return float(np.std(self.per_run(metric), ddof=1)) if len(self.runs) > 1 else float("nan")
+
+    def difference(self, reference: Result, metric: str) -> Interval:
+        """Mean paired difference to another row over the paths both met, and its interval.
+
+        BCa bootstrap; between rows with several runs, Student's t over runs and paths.
+        """
+        n = min(self.episodes, reference.episodes)
+        values, others = self.per_path(metric)[:n], reference.per_path(metric)[:n]
+        if not self.runs and not reference.runs:
+            return paired_difference(values, others)
+        parts = [standard_error(values - others)]
+        parts += [standard_error(row.per_run(metric, n)) for row in (self, reference) if row.runs]
+        trainings = [len(row.runs) for row in (self, reference) if row.runs]
+        error = float(np.sqrt(np.sum(np.square(parts))))
+        return student_interval(float(np.mean(values - others)), error, min(trainings) - 1)
 
     @property
     def collision_rate(self) -> float:
@@ -125,8 +194,18 @@ class Result:
 
     @property
     def collision_interval(self) -> tuple[float, float]:
-        """Wilson 95 % interval of the collision rate."""
-        return wilson_interval(int(self.metrics.collision.sum()), self.episodes)
+        """95 % interval of the collision rate: Wilson's."""
+        return self._rate_interval("collision")
+
+    @property
+    def between_rate(self) -> float:
+        """Share of episodes that touch one at a node or between nodes (Brownian bridges)."""
+        return float(self.metrics.touched.mean())
+
+    @property
+    def between_interval(self) -> tuple[float, float]:
+        """95 % interval of `between_rate`; Wilson's, which errs on the safe side for it."""
+        return self._rate_interval("touched")
 
     @property
     def total(self) -> float:
@@ -136,7 +215,7 @@ class Result:
     @property
     def total_se(self) -> float:
         """Standard error of `total`."""
-        return standard_error(self.metrics.total)
+        return self._error("total")
 
     @property
     def effort(self) -> float:
@@ -146,7 +225,7 @@ class Result:
     @property
     def effort_se(self) -> float:
         """Standard error of `effort`."""
-        return standard_error(self.metrics.effort)
+        return self._error("effort")
 
     @property
     def obstacle(self) -> float:
@@ -156,7 +235,7 @@ class Result:
     @property
     def obstacle_se(self) -> float:
         """Standard error of `obstacle`."""
-        return standard_error(self.metrics.obstacle)
+        return self._error("obstacle")
 
     @property
     def goal(self) -> float:
@@ -166,7 +245,7 @@ class Result:
     @property
     def goal_se(self) -> float:
         """Standard error of `goal`."""
-        return standard_error(self.metrics.goal)
+        return self._error("goal")
 
     @property
     def position_rms(self) -> float:
@@ -184,20 +263,43 @@ class Result:
         return _rms(self.metrics.speed_error)
 
     @property
+    def cost_quantiles(self) -> dict[float, float]:
+        """Quantile -> cost of a path, for :data:`COST_QUANTILES`."""
+        return {q: quantile(self.metrics.total, q) for q in COST_QUANTILES}
+
+    @property
+    def cost_cvar(self) -> tuple[float, float]:
+        """Mean cost of the dearest 5 % of the paths, and its standard error."""
+        value, error = cvar(self.metrics.total, TAIL)
+        if self.runs:
+            parts = [run.cost_cvar for run in self.runs]
+            paths = float(np.mean([error for _, error in parts]))  # common paths: not averaged out
+            error = _together(paths, standard_error(np.array([value for value, _ in parts])))
+        return value, error
+
+    @property
     def clearance_quantiles(self) -> dict[float, float]:
         """Quantile -> clearance [m], for :data:`CLEARANCE_QUANTILES`."""
-        # No interpolation: between infinities (no obstacles) there is nothing to interpolate.
-        values = np.quantile(self.metrics.clearance, CLEARANCE_QUANTILES, method="inverted_cdf")
-        return dict(zip(CLEARANCE_QUANTILES, values.tolist(), strict=True))
+        return {q: quantile(self.metrics.clearance, q) for q in CLEARANCE_QUANTILES}
+
+    @property
+    def clearance_cvar(self) -> float:
+        """Mean clearance of the 5 % of the paths that come closest [m]."""
+        value, _ = cvar(-self.metrics.clearance, TAIL)
+        return -value
 
     def summary(self) -> dict[str, float | int | bool]:
         """Every aggregate as one flat row, SI units: a row of `Comparison.frame`."""
         low, high = self.collision_interval
+        between_low, between_high = self.between_interval
+        tail, tail_error = self.cost_cvar
         return {
             "closed_loop": self.closed_loop,
             "episodes": self.episodes,
+            "runs": max(1, len(self.runs)),
             "total": self.total,
             "total_se": self.total_se,
+            "total_spread": self.spread("total"),
             "effort": self.effort,
             "effort_se": self.effort_se,
             "obstacle": self.obstacle,
@@ -207,14 +309,42 @@ class Result:
             "collision_rate": self.collision_rate,
             "collision_low": low,
             "collision_high": high,
+            "collision_spread": self.spread("collision"),
+            "between_rate": self.between_rate,
+            "between_low": between_low,
+            "between_high": between_high,
+            **{f"total_p{100 * q:02.0f}": v for q, v in self.cost_quantiles.items()},
+            "total_cvar95": tail,
+            "total_cvar95_se": tail_error,
             "position_rms": self.position_rms,
             "heading_rms": self.heading_rms,
             "speed_rms": self.speed_rms,
             **{f"clearance_p{100 * q:02.0f}": v for q, v in self.clearance_quantiles.items()},
+            "clearance_cvar05": self.clearance_cvar,
             "failures": self.failures,
             "inference_time": self.inference_time,
             "preparation_time": self.preparation_time,
         }
+
+    def _error(self, metric: str) -> float:
+        paths = standard_error(self.per_path(metric))
+        return _together(paths, standard_error(self.per_run(metric))) if self.runs else paths
+
+    def _rate_interval(self, metric: str) -> tuple[float, float]:
+        values = self.per_path(metric)
+        low, high = rate_interval(values)
+        if self.runs:
+            # Never narrower than for a single controller, also where no run ever collided.
+            _, lower, higher = student_interval(
+                float(values.mean()), self._error(metric), len(self.runs) - 1
+            )
+            low, high = max(0.0, min(low, lower)), min(1.0, max(high, higher))
+        return low, high
+
+
+def _together(paths: float, trainings: float) -> float:
+    """Standard error from that over the paths and that over the trainings, which met the same."""
+    return float(np.hypot(paths, trainings))
 
 
 def _rms(values: np.ndarray) -> float:

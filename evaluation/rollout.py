@@ -10,53 +10,32 @@ whole: linear algebra rounds by the shape it is given, so a policy that saw 1000
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import sys
 import time
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
-import threadpoolctl
 
 from slipcar.envs import observation as layouts
+from slipcar.envs.integrate import added_up
 from slipcar.envs.options import check_slots
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.validate import checked_int
-from slipcar.evaluation.metrics import EpisodeMetrics
+from slipcar.evaluation.between import log_clear
+from slipcar.evaluation.controller import (
+    Controller,
+    check_controller,
+    checked_answer,
+    controller_name,
+    observation_layout,
+)
+from slipcar.evaluation.executors import open_executor, run
+from slipcar.evaluation.limits import time_limit
+from slipcar.evaluation.metrics import EpisodeMetrics, Result
 from slipcar.evaluation.noise import BLOCK, block_noise, block_starts
-
-
-@runtime_checkable
-class Controller(Protocol):
-    """What is evaluated: an object with the `predict` of Stable-Baselines3.
-
-    Optional attributes:
-        observation: `"features"` (default), `"state"` or `"egocentric"`: what `predict` is given.
-        obstacle_slots: how many obstacles it is shown besides (default 0).
-        closed_loop: whether it looks at the state (default True).
-        preparation_time: seconds of planning or training (default unknown).
-        failures: solves behind it that failed (default 0).
-        fingerprint(): text that identifies its behaviour, so that a stored row can be reused.
-        rows: how many episodes `predict` is given at once, a divisor of 1024 (default 1024).
-            Always exactly that many, also when fewer episodes are asked for; a controller that
-            is slow per row sets 1.
-    """
-
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[np.ndarray, Any]:
-        """Actions in [−1, 1], (rows, 2), and the next hidden state.
-
-        A state may have `failures` (rows,): solves that failed so far in each episode.
-        """
-        ...
+from slipcar.evaluation.threads import one_thread
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +47,7 @@ class Step:
         before: where it began, x_k, (rows, 5).
         control: u_k, (rows, 2) [m/s², rad/s²].
         moved: where it led; `moved.state` is x_{k+1}, (rows, 5).
+        passed: each substep's states before and after, as components.
         seconds: spent inside `predict`.
         failures: solves that failed so far in each episode, (rows,); None if its state does not
             say.
@@ -77,23 +57,9 @@ class Step:
     before: np.ndarray
     control: np.ndarray
     moved: Transition
+    passed: list[tuple[Any, Any]]
     seconds: float
     failures: np.ndarray | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Rollout:
-    """What :func:`rollout` measured.
-
-    Attributes:
-        metrics: per-episode arrays.
-        inference_time: seconds inside `predict` per step and episode.
-        failures: solves that failed on the way, if the controller's state counts them; else None.
-    """
-
-    metrics: EpisodeMetrics
-    inference_time: float
-    failures: int | None = None
 
 
 def check_counts(
@@ -112,7 +78,7 @@ def check_counts(
         checked_int("batch_size", batch_size, at_least=1)
 
 
-def rollout(
+def evaluate(
     controller: Controller,
     scenario: Scenario | str,
     episodes: int = 10_000,
@@ -122,20 +88,27 @@ def rollout(
     batch_size: int | None = None,
     n_jobs: int = 1,
     progress: Callable[[int], None] | None = None,
-) -> Rollout:
-    """Drive `episodes` episodes and measure each.
+) -> Result:
+    """Drive many episodes and say what came of them.
+
+    Example:
+        >>> from slipcar.evaluation import evaluate
+        >>> from slipcar.planner import OpenLoop, plan
+        >>> r = evaluate(OpenLoop(plan(scenario)), scenario, episodes=10_000, seed=0)
+        >>> r.collision_rate, r.collision_interval, r.total, r.total_se
 
     The result is the same, bit for bit, for any `batch_size` and `n_jobs`; memory holds the
-    per-episode metrics and one block.
+    per-episode metrics (72 bytes an episode) and one block.
 
     Args:
-        controller: see :class:`Controller`.
+        controller: any object with the `predict` of Stable-Baselines3; see
+            :class:`slipcar.evaluation.controller.Controller` for what else it may offer.
         scenario: a scenario or the name of one.
         episodes: how many, >= 1.
         seed: of the Brownian paths, >= 0; episode i depends on (seed, i) alone.
         substeps: Euler–Maruyama steps in each control interval.
-        batch_size: episodes in one task of a worker, rounded up to whole blocks; None shares
-            them out evenly.
+        batch_size: episodes in one task of a worker, rounded up to whole blocks of 1024; None
+            shares them out evenly.
         n_jobs: worker processes (joblib's loky, one thread in each); 1 stays in this process.
         progress: called with the number of episodes finished since the last call.
 
@@ -148,23 +121,38 @@ def rollout(
     check_controller(controller)
     blocks = -(-episodes // BLOCK)
     if batch_size is None:
-        per_task = min(16, -(-blocks // (4 * n_jobs)))  # some tasks a worker, for balance
+        size = BLOCK * min(16, -(-blocks // (4 * n_jobs)))  # some tasks a worker, for balance
     else:
-        per_task = -(-batch_size // BLOCK)
-    tasks = [range(b, min(b + per_task, blocks)) for b in range(0, blocks, per_task)]
-    parts, seconds, rows = [], 0.0, 0
-    failures: int | None = None
-    common = (controller, scenario, episodes, seed, substeps)
-    for part, part_seconds, part_failures in _run(tasks, n_jobs, common):
-        parts.append(part)
-        seconds += part_seconds
-        rows += len(part)
-        if part_failures is not None:
-            failures = (failures or 0) + part_failures
-        if progress is not None:
-            progress(len(part))
-    steps = scenario.nodes - 1
-    return Rollout(EpisodeMetrics.concatenate(parts), seconds / (rows * steps), failures)
+        size = BLOCK * -(-batch_size // BLOCK)
+    tasks = [
+        Stretch(controller, scenario, first, min(size, episodes - first), seed, substeps)
+        for first in range(0, episodes, size)
+    ]
+    done: dict[int, Measured] = {}
+    with open_executor(n_jobs if len(tasks) > 1 else 1) as executor:
+        for task, measured, error in run(measure, tasks, executor):
+            if error is not None:
+                raise error
+            done[task.first] = measured
+            if progress is not None:
+                progress(task.episodes)
+    return joined([done[first] for first in sorted(done)], scenario, seed, substeps)
+
+
+def joined(parts: Sequence[Measured], scenario: Scenario, seed: int, substeps: int) -> Result:
+    """Stretches of one row, in order, as one."""
+    metrics = EpisodeMetrics.concatenate([part.metrics for part in parts])
+    states = [part for part in parts if part.counted]
+    return Result(
+        metrics=metrics,
+        seed=seed,
+        substeps=substeps,
+        closed_loop=parts[0].closed_loop,
+        failures=sum(part.failures for part in states) if states else parts[0].failures,
+        inference_time=sum(part.seconds for part in parts) / (len(metrics) * (scenario.nodes - 1)),
+        preparation_time=parts[0].preparation_time,
+        wall_time=sum(part.wall_time for part in parts),
+    )
 
 
 def sample_paths(
@@ -176,7 +164,7 @@ def sample_paths(
         States (episodes, N, 5) and controls (episodes, N−1, 2), SI units.
 
     Raises:
-        ValueError: as :func:`rollout`.
+        ValueError: as :func:`evaluate`.
     """
     scenario = Scenario.of(scenario)
     checked_int("episodes", episodes, at_least=1)
@@ -241,141 +229,133 @@ def play(
                 )
                 raise
             seconds += time.perf_counter() - began
-            action, hidden[c] = _checked_answer(controller, scenario, answer, chunk, k, first)
+            action, hidden[c] = checked_answer(controller, scenario, answer, chunk, k, first)
             control[here] = control_from_action(scenario, action, (chunk,))
-        moved = transition(scenario, x, control, variates[:rows])
+        passed: list[tuple[Any, Any]] = []
+
+        def add(before: Any, added: Any, passed: list[tuple[Any, Any]] = passed) -> Any:
+            after = added_up(before, added)
+            passed.append((before, after))
+            return after
+
+        moved = transition(scenario, x, control, variates[:rows], add)
         counted = [state.failures for state in hidden if hasattr(state, "failures")]
         failures = np.concatenate(counted) if len(counted) == len(chunks) else None
-        yield Step(k, x, control, moved, seconds, failures)
+        yield Step(k, x, control, moved, passed, seconds, failures)
         x = moved.state
         starts = np.zeros(chunk, dtype=bool)
 
 
-def observation_layout(controller: Controller) -> layouts.Layout:
-    """What `predict` is to be given: its `observation` and `obstacle_slots`, else what fits.
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """Episodes in a row, to be driven by one worker.
+
+    Attributes:
+        controller: who drives, or a function of the scenario that makes it: then the worker plans.
+        scenario: where.
+        first: the first episode, a multiple of :data:`BLOCK`.
+        episodes: how many.
+        seed: of the Brownian paths.
+        substeps: Euler–Maruyama steps in each control interval.
+        time_limit: seconds that a block of 1024 may take, or None.
+    """
+
+    controller: Controller | Callable[[Scenario], Controller]
+    scenario: Scenario
+    first: int
+    episodes: int
+    seed: int
+    substeps: int = 1
+    time_limit: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """What a stretch came to.
+
+    Attributes:
+        metrics: per-episode arrays.
+        seconds: spent inside `predict`, for these episodes.
+        failures: solves that failed on the way, if the controller's state counts them; else those
+            behind the controller (a plan that did not converge is one).
+        counted: whether its state counts them, and so stretches add up.
+        closed_loop: whether the controller looks at the state.
+        preparation_time: seconds of planning or training; nan when unknown.
+        wall_time: seconds it took.
+    """
+
+    metrics: EpisodeMetrics
+    seconds: float
+    failures: int
+    counted: bool
+    closed_loop: bool
+    preparation_time: float
+    wall_time: float
+
+
+def measure(stretch: Stretch) -> Measured:
+    """Drive the episodes of a stretch and measure each.
 
     Raises:
-        ValueError: for an unknown kind, or a space that no observation fits.
+        ValueError: as :func:`evaluate`.
+        TimeLimitError: if a block took too long.
     """
-    named = getattr(controller, "observation", None)
-    if isinstance(named, str):
-        return layouts.Layout(named, getattr(controller, "obstacle_slots", 0))
-    # A Stable-Baselines3 model says what it was trained on by its space alone.
-    shape = getattr(getattr(controller, "observation_space", None), "shape", None)
-    if shape is None:
-        return layouts.Layout()
-    try:
-        return layouts.Layout.of_size(shape[0] if len(shape) == 1 else 0)
-    except ValueError as error:
-        raise ValueError(
-            f"{controller_name(controller)} expects observations of shape {shape}: {error}"
-        ) from None
-
-
-def controller_name(controller: Any) -> str:
-    """What an error calls it."""
-    return type(controller).__name__
-
-
-def check_controller(controller: Any) -> None:
-    """Raises ValueError unless `controller` has a `predict` and sensible optional attributes."""
-    if not callable(getattr(controller, "predict", None)):
-        raise ValueError(
-            f"a controller is an object with predict(observation, state, episode_start, "
-            f"deterministic), which {controller!r} has not"
-        )
-    observation_layout(controller)
-    rows = checked_int("rows", getattr(controller, "rows", BLOCK), at_least=1, at_most=BLOCK)
-    if BLOCK % rows:
-        raise ValueError(f"{controller_name(controller)}.rows must divide {BLOCK}, not {rows}")
-
-
-def _run(
-    tasks: list[range], n_jobs: int, common: tuple
-) -> Iterator[tuple[EpisodeMetrics, float, int | None]]:
-    if n_jobs == 1 or len(tasks) == 1:
-        with one_thread():
-            for task in tasks:
-                yield _measure(task, *common)
-        return
-    import joblib
-
-    with joblib.parallel_config(backend="loky", n_jobs=n_jobs, inner_max_num_threads=1):
-        yield from joblib.Parallel(return_as="generator")(
-            joblib.delayed(_measure)(task, *common) for task in tasks
-        )
-
-
-def _measure(
-    blocks: range,
-    controller: Controller,
-    scenario: Scenario,
-    episodes: int,
-    seed: int,
-    substeps: int,
-) -> tuple[EpisodeMetrics, float, int | None]:
-    """Metrics of the episodes in `blocks`; seconds of `predict` and failures they account for."""
+    began = time.perf_counter()
     parts, seconds = [], 0.0
     failures: int | None = None
-    for block in blocks:
-        wanted = min(BLOCK, episodes - block * BLOCK)
-        effort, obstacle = np.zeros(()), np.zeros(())
+    scenario = stretch.scenario
+    controller = _made(stretch)
+    h = scenario.dt / stretch.substeps
+    for first in range(stretch.first, stretch.first + stretch.episodes, BLOCK):
+        wanted = min(BLOCK, stretch.first + stretch.episodes - first)
+        effort, obstacle, clear = np.zeros(()), np.zeros(()), np.zeros(())
         clearance = np.full((), np.inf)
-        for step in play(controller, scenario, seed, block, wanted, substeps):
-            moved = step.moved
-            effort = effort + moved.effort
-            obstacle = obstacle + moved.obstacle
-            clearance = np.minimum(clearance, moved.distance)
-            seconds += step.seconds * wanted / len(step.control)
-        whole = EpisodeMetrics.of(scenario, effort, obstacle, clearance, moved.state)
+        nearest: np.ndarray | None = None
+        played = play(controller, scenario, stretch.seed, first // BLOCK, wanted, stretch.substeps)
+        with time_limit(stretch.time_limit, f"{wanted} episodes") as look:
+            for step in played:
+                look()
+                moved = step.moved
+                effort = effort + moved.effort
+                obstacle = obstacle + moved.obstacle
+                clearance = np.minimum(clearance, moved.distance)
+                if len(step.passed) > 1 or nearest is None:
+                    between = [log_clear(scenario, *ends, h) for ends in step.passed]
+                else:
+                    known = nearest, moved.distance
+                    between = [log_clear(scenario, *step.passed[0], h, known)]
+                clear = clear + sum(between)
+                nearest = moved.distance
+                seconds += step.seconds * wanted / len(step.control)
+        whole = EpisodeMetrics.of(scenario, effort, obstacle, clearance, clear, moved.state)
         parts.append(whole.first(wanted))
         if step.failures is not None:
             failures = (failures or 0) + int(step.failures[:wanted].sum())
-    return EpisodeMetrics.concatenate(parts), seconds, failures
+    preparation = getattr(controller, "preparation_time", None)
+    return Measured(
+        metrics=EpisodeMetrics.concatenate(parts),
+        seconds=seconds,
+        failures=solver_failures(controller) if failures is None else failures,
+        counted=failures is not None,
+        closed_loop=bool(getattr(controller, "closed_loop", True)),
+        preparation_time=float("nan") if preparation is None else float(preparation),
+        wall_time=time.perf_counter() - began,
+    )
 
 
-def _checked_answer(
-    controller: Controller, scenario: Scenario, answer: Any, rows: int, k: int, first: int
-) -> tuple[np.ndarray, Any]:
-    name = controller_name(controller)
-    where = f"at step {k} (t = {scenario.times[k]:.4g} s)"
-    if not isinstance(answer, tuple) or len(answer) != 2:
-        raise ValueError(
-            f"{name}.predict must return (action, state), not {type(answer).__name__} {where}"
-        )
-    try:
-        action = np.asarray(answer[0], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}.predict returned no array of numbers {where}: {error}") from error
-    if action.shape != (rows, 2):
-        raise ValueError(
-            f"{name}.predict must return actions of shape {(rows, 2)}, not {action.shape}, "
-            f"{where}, episodes {first} to {first + rows - 1}"
-        )
-    if not np.isfinite(action).all():
-        row, column = (int(i) for i in np.argwhere(~np.isfinite(action))[0])
-        raise ValueError(
-            f"{name}.predict returned {action[row, column]} for action[{column}] {where}, "
-            f"episode {first + row}; actions must be finite (they are clipped to [-1, 1])"
-        )
-    return action, answer[1]
+def _made(stretch: Stretch) -> Controller:
+    if callable(getattr(stretch.controller, "predict", None)):
+        return stretch.controller  # type: ignore[return-value]
+    with time_limit(stretch.time_limit, "making the controller"):
+        made = stretch.controller(stretch.scenario)  # type: ignore[operator]
+    check_controller(made)
+    return made
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """BLAS and torch on one thread, as in the workers.
-
-    Threads split matrix products, and so the order of their sums, by how many there are; for
-    the small matrices of a policy one is faster as well.
-    """
-    with threadpoolctl.threadpool_limits(1):
-        torch = sys.modules.get("torch")
-        if torch is None:
-            yield
-            return
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
+def solver_failures(controller: Controller) -> int:
+    """Solves behind a controller that failed: its `failures`, else 1 for an unconverged plan."""
+    counted = getattr(controller, "failures", None)
+    if counted is not None:
+        return int(counted)
+    status = getattr(getattr(controller, "plan", None), "status", None)
+    return int(status is not None and not status.ok)

@@ -106,13 +106,13 @@ def check_risk(delta: Any) -> None:
         raise ValueError(f"risk must be a probability in (0, 1), e.g. 0.01 for 1 %, not {delta!r}")
 
 
-def wilson_interval(successes: int, trials: int, level: float = CONFIDENCE) -> tuple[float, float]:
+def wilson_interval(successes: float, trials: int, level: float = CONFIDENCE) -> tuple[float, float]:
     """Wilson score interval of a proportion: the p with |k/n − p| ≤ z √(p (1 − p) / n).
 
     Unlike the normal interval it stays in [0, 1] and says something when nothing was observed.
 
     Args:
-        successes: k, 0 ≤ k ≤ n.
+        successes: k, 0 ≤ k ≤ n (a sum of probabilities need not be whole).
         trials: n ≥ 1.
         level: coverage, in (0, 1); z is the normal quantile of (1 + level) / 2.
 

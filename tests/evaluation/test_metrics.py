@@ -14,6 +14,7 @@ def made(total, clearance):
             goal=np.full(n, 0.25),
             collision=clearance < 0.0,
             clearance=clearance,
+            touched=np.where(clearance < 0.0, 1.0, 0.125),
             position_error=np.arange(n, dtype=float),
             heading_error=np.full(n, 0.1),
             speed_error=np.zeros(n),

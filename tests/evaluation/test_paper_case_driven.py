@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slipcar.evaluation import compare, evaluate, sample_paths
-from slipcar.evaluation.compare import solver_failures
+from slipcar.evaluation.rollout import solver_failures
 from slipcar.evaluation.rows import (
     CHANCE,
     DETERMINISTIC,

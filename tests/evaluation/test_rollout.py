@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.evaluation import rollout, sample_paths
+from slipcar.evaluation import evaluate, sample_paths
 from slipcar.evaluation.metrics import FIELDS
 from slipcar.evaluation.noise import BLOCK, block_generator, block_noise
 
@@ -17,7 +17,7 @@ def same(a, b):
 
 
 def test_a_standing_car_does_not_move(paper, replay):
-    metrics = rollout(replay(paper, (0.0, 0.0)), paper, 10).metrics
+    metrics = evaluate(replay(paper, (0.0, 0.0)), paper, 10).metrics
     np.testing.assert_array_equal(metrics.total, paper.goal_cost(paper.start))
     np.testing.assert_array_equal(metrics.effort, 0.0)
     np.testing.assert_allclose(metrics.clearance, paper.signed_distance(paper.start))
@@ -30,7 +30,7 @@ def test_a_straight_drive_has_no_noise(replay):
     way = 0.8 * open_field.times
     expected = np.stack([way * np.cos(0.3), way * np.sin(0.3)], axis=-1)
     np.testing.assert_allclose(states[..., :2], np.broadcast_to(expected, (50, 41, 2)), atol=1e-12)
-    metrics = rollout(replay(open_field, (0.0, 0.0)), open_field, 50).metrics
+    metrics = evaluate(replay(open_field, (0.0, 0.0)), open_field, 50).metrics
     assert np.ptp(metrics.total) == 0.0
     assert np.isinf(metrics.clearance).all()
 
@@ -41,7 +41,7 @@ def test_heading_variance_of_a_circle_is_that_of_brownian_motion(replay):
     circle = Scenario(
         start=(0, 0, 0, v, omega), goal=(0, 0, omega * T, v, omega), horizon=T, slip=(0.1, beta2)
     )
-    errors = rollout(replay(circle, (0.0, 0.0)), circle, 40_000, seed=3).metrics.heading_error
+    errors = evaluate(replay(circle, (0.0, 0.0)), circle, 40_000, seed=3).metrics.heading_error
     expected = T * (beta2 * omega * v) ** 2
     # The variance of a sample of n squares has relative error √(2/n) = 0.7 %.
     assert np.mean(errors**2) == pytest.approx(expected, rel=0.03)
@@ -64,7 +64,7 @@ def test_agrees_with_one_path_written_out(paper, replay, turning):
             obstacle += dt * 500.0 * max(0.0, (radius + 0.13) ** 2 - distance**2) ** 2
             clearance = min(clearance, distance - radius)
     error = x - np.array([2.2, 3.0, 0, 0, 0])
-    metrics = rollout(replay(paper, turning), paper, episode + 1, seed).metrics
+    metrics = evaluate(replay(paper, turning), paper, episode + 1, seed).metrics
     # Actions travel as float32.
     assert metrics.effort[episode] == pytest.approx(effort, rel=1e-6)
     assert metrics.obstacle[episode] == pytest.approx(obstacle, rel=1e-5, abs=1e-9)
@@ -78,7 +78,7 @@ def test_agrees_with_one_path_written_out(paper, replay, turning):
 
 def test_without_slip_all_paths_are_one(paper, replay, turning):
     dry = paper.replace(slip=(0.0, 0.0))
-    metrics = rollout(replay(dry, turning), dry, 300).metrics
+    metrics = evaluate(replay(dry, turning), dry, 300).metrics
     assert np.ptp(metrics.total) == 0.0
 
 
@@ -112,25 +112,25 @@ def test_noise_is_standard_normal_and_differs_between_blocks_and_seeds(paper):
 
 @pytest.mark.parametrize("batch_size", [1, 1000, BLOCK, 2500, 100_000])
 def test_results_do_not_depend_on_the_batch_size(paper, layers, batch_size):
-    whole = rollout(layers(), paper, 2500, seed=1).metrics
-    assert same(whole, rollout(layers(), paper, 2500, seed=1, batch_size=batch_size).metrics)
+    whole = evaluate(layers(), paper, 2500, seed=1).metrics
+    assert same(whole, evaluate(layers(), paper, 2500, seed=1, batch_size=batch_size).metrics)
 
 
 def test_results_do_not_depend_on_the_workers(paper, layers):
-    alone = rollout(layers(), paper, 2500, seed=1).metrics
-    assert same(alone, rollout(layers(), paper, 2500, seed=1, n_jobs=2).metrics)
+    alone = evaluate(layers(), paper, 2500, seed=1).metrics
+    assert same(alone, evaluate(layers(), paper, 2500, seed=1, n_jobs=2).metrics)
 
 
 def test_an_episode_depends_on_seed_and_index_alone(paper, layers):
-    many = rollout(layers(), paper, 2000, seed=1).metrics
-    assert same(rollout(layers(), paper, 1, seed=1).metrics, many.first(1))
-    assert same(rollout(layers(), paper, 1100, seed=1).metrics, many.first(1100))
-    assert not same(rollout(layers(), paper, 1100, seed=2).metrics, many.first(1100))
+    many = evaluate(layers(), paper, 2000, seed=1).metrics
+    assert same(evaluate(layers(), paper, 1, seed=1).metrics, many.first(1))
+    assert same(evaluate(layers(), paper, 1100, seed=1).metrics, many.first(1100))
+    assert not same(evaluate(layers(), paper, 1100, seed=2).metrics, many.first(1100))
 
 
 def test_recorded_paths_are_those_measured(paper, layers):
     states, controls = sample_paths(layers(), paper, 1100, seed=4)
-    metrics = rollout(layers(), paper, 1100, seed=4).metrics
+    metrics = evaluate(layers(), paper, 1100, seed=4).metrics
     np.testing.assert_array_equal(paper.goal_cost(states[:, -1]), metrics.goal)
     distance = paper.signed_distance(states[:, 1:]).min(axis=1)
     np.testing.assert_array_equal(distance, metrics.clearance)
@@ -139,8 +139,8 @@ def test_recorded_paths_are_those_measured(paper, layers):
 
 
 def test_substeps_refine_the_same_problem(paper, replay, turning):
-    coarse = rollout(replay(paper, turning), paper, 20_000, substeps=1).metrics
-    fine = rollout(replay(paper, turning), paper, 20_000, substeps=4).metrics
+    coarse = evaluate(replay(paper, turning), paper, 20_000, substeps=1).metrics
+    fine = evaluate(replay(paper, turning), paper, 20_000, substeps=4).metrics
     np.testing.assert_array_equal(coarse.effort, fine.effort)
     # Order 1 in the step: a fourth of the step moves the mean by a few centimetres at most.
     assert coarse.position_error.mean() == pytest.approx(fine.position_error.mean(), abs=0.1)
@@ -164,7 +164,7 @@ class Recorder:
 
 def test_hidden_state_and_episode_start_are_passed_on(paper):
     recorder = Recorder()
-    rollout(recorder, paper, 10)
+    evaluate(recorder, paper, 10)
     assert [state for _, state, _, _ in recorder.calls] == [None, *range(39)]
     assert [start.all() for _, _, start, _ in recorder.calls] == [True] + 39 * [False]
     assert all(deterministic for *_, deterministic in recorder.calls)
@@ -173,7 +173,7 @@ def test_hidden_state_and_episode_start_are_passed_on(paper):
 @pytest.mark.parametrize(("attributes", "entries"), [({}, 12), ({"observation": "state"}, 6)])
 def test_the_controller_chooses_its_observation(paper, attributes, entries):
     recorder = Recorder(**attributes)
-    rollout(recorder, paper, 10)
+    evaluate(recorder, paper, 10)
     assert {call[0].shape for call in recorder.calls} == {(BLOCK, entries)}
 
 
@@ -181,20 +181,20 @@ def test_a_stable_baselines_model_is_given_what_it_was_trained_on(paper):
     from gymnasium.spaces import Box
 
     recorder = Recorder(observation_space=Box(-1, 1, (6,)))
-    rollout(recorder, paper, 1)
+    evaluate(recorder, paper, 1)
     assert recorder.calls[0][0].shape == (BLOCK, 6)
     with pytest.raises(ValueError, match=r"shape \(7,\).*12 \(features\)"):
-        rollout(Recorder(observation_space=Box(-1, 1, (7,))), paper, 1)
+        evaluate(Recorder(observation_space=Box(-1, 1, (7,))), paper, 1)
 
 
 def test_a_slow_controller_is_shown_only_the_rows_it_wants(paper, replay, turning):
     recorder = Recorder(rows=2)
-    rollout(recorder, paper, 3)
+    evaluate(recorder, paper, 3)
     assert {call[0].shape for call in recorder.calls} == {(2, 12)}
     assert len(recorder.calls) == 2 * 40
     alone, all_at_once = replay(paper, turning), replay(paper, turning)
     alone.rows = 1
-    assert same(rollout(alone, paper, 5).metrics, rollout(all_at_once, paper, 5).metrics)
+    assert same(evaluate(alone, paper, 5).metrics, evaluate(all_at_once, paper, 5).metrics)
 
 
 # ------------------------------------------------------------------ bad input
@@ -226,7 +226,7 @@ def nan_in_episode_5(observation):
 )
 def test_a_bad_action_is_named(paper, answer, message):
     with pytest.raises(ValueError, match=message):
-        rollout(Answer(answer), paper, 10)
+        evaluate(Answer(answer), paper, 10)
 
 
 def test_what_goes_wrong_later_is_named_by_its_step_and_episode(paper):
@@ -239,7 +239,7 @@ def test_what_goes_wrong_later_is_named_by_its_step_and_episode(paper):
             return action, None
 
     with pytest.raises(ValueError, match=re.escape("action[0] at step 8 (t = 1 s), episode 3")):
-        rollout(Late(), paper, 10)
+        evaluate(Late(), paper, 10)
 
 
 @pytest.mark.parametrize(
@@ -260,9 +260,9 @@ def test_what_goes_wrong_later_is_named_by_its_step_and_episode(paper):
 def test_bad_arguments_are_named(change, message):
     arguments = {"controller": Recorder(), "scenario": "paper", "episodes": 10, **change}
     with pytest.raises(ValueError, match=message):
-        rollout(**arguments)
+        evaluate(**arguments)
 
 
 def test_an_unbounded_scenario_cannot_scale_actions(paper):
     with pytest.raises(ValueError, match="control_bounds is None"):
-        rollout(Recorder(), paper.replace(control_bounds=None), 10)
+        evaluate(Recorder(), paper.replace(control_bounds=None), 10)

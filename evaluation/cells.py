@@ -1,0 +1,183 @@
+"""Finished pieces of an evaluation on disk: written atomically, reused only where all agrees.
+
+A cell is a stretch of episodes of one row. Its key holds everything that its numbers depend on:
+scenario, seed, episodes, substeps, what drives, the source that computes it and the versions of
+the libraries below. The file is named by the key, so a changed option finds what it touches
+missing and all else in place, and more episodes add cells to those that are there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import inspect
+import io
+import json
+import pickle
+import platform
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slipcar.baselines import Policy
+from slipcar.baselines.files import write_atomically
+from slipcar.evaluation.metrics import FIELDS, EpisodeMetrics
+from slipcar.evaluation.noise import BLOCK
+from slipcar.evaluation.provenance import code_digest, versions
+from slipcar.evaluation.rollout import Measured, Stretch
+from slipcar.planner import Feedback, OpenLoop
+
+FORMAT = 2
+_SCALARS = tuple(f.name for f in dataclasses.fields(Measured) if f.name != "metrics")
+#: Whose versions count, by the first two parts of the module that a controller comes from.
+_PLANNING = ("numpy", "scipy", "numba")
+_ANY = (*_PLANNING, "gymnasium", "torch", "stable-baselines3", "cvxpy", "osqp")
+
+
+def cell_size(controller: Any) -> int:
+    """Episodes in one cell: many of what is quick, one block of what may be slow."""
+    return BLOCK * (8 if isinstance(controller, (OpenLoop, Feedback, Policy)) else 1)
+
+
+def cell_key(stretch: Stretch) -> dict[str, Any] | None:
+    """All that a cell depends on, as plain data; None if what drives cannot be identified."""
+    fingerprint = controller_fingerprint(stretch.controller)
+    if fingerprint is None:
+        return None
+    return {
+        "format": FORMAT,
+        "scenario": stretch.scenario.to_dict(),
+        "seed": stretch.seed,
+        "first": stretch.first,
+        "episodes": stretch.episodes,
+        "substeps": stretch.substeps,
+        "controller": fingerprint,
+        **_software(stretch.controller),
+    }
+
+
+def _software(controller: Any) -> dict[str, Any]:
+    """Source and library versions that a controller's numbers depend on."""
+    if isinstance(controller, Policy):
+        parts, packages = ("envs", "policy", "core"), ("numpy",)
+    elif type(controller).__module__.startswith("slipcar.planner."):
+        parts, packages = ("envs", "planner", "core"), _PLANNING
+    else:  # anybody's: it may use all of it
+        parts, packages = ("envs", "planner", "policy", "core"), _ANY
+    return {
+        "code": code_digest(*parts),
+        "python": platform.python_version(),
+        "versions": {name: found for name, found in _versions() if name in packages},
+    }
+
+
+@functools.cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    return tuple(versions().items())
+
+
+def controller_fingerprint(controller: Any) -> str | None:
+    """What identifies a controller's behaviour: its own `fingerprint()`, else a digest.
+
+    The digest covers its pickle and the source file of its class. Where that cannot be had
+    the answer is None and nothing of it is reused: better done twice than wrong.
+    """
+    own = getattr(controller, "fingerprint", None)
+    if callable(own):
+        told = own()
+        return None if told is None else f"{type(controller).__qualname__}:{told}"
+    try:
+        data = pickle.dumps(controller)
+        source = Path(inspect.getfile(type(controller))).read_bytes()
+    except Exception:  # whatever a user's object raises when pickled: it has no fingerprint
+        return None
+    return hashlib.sha256(data + source).hexdigest()
+
+
+class Store:
+    """Where finished cells are kept: in a folder, or in memory alone.
+
+    Attributes:
+        folder: with a folder `cells`, or None.
+        resume: whether cells that were there before may be used.
+        trouble: what went wrong when writing, said once; then cells stay in memory.
+    """
+
+    def __init__(self, folder: str | Path | None = None, resume: bool = True) -> None:
+        self.folder = None if folder is None else Path(folder) / "cells"
+        self.resume = resume
+        self.trouble = ""
+        self._memory: dict[str, Measured] = {}
+        self._asked: set[str] = set()
+
+    def get(self, key: dict[str, Any] | None) -> Measured | None:
+        """The cell with this key, or None if it is not there, or damaged."""
+        if key is None:
+            return None
+        name = cell_name(key)
+        new = name not in self._asked
+        self._asked.add(name)
+        if name in self._memory:
+            return self._memory[name]
+        if self.folder is None or (new and not self.resume):
+            return None
+        return read_cell(self.folder / name, key)
+
+    def put(self, key: dict[str, Any] | None, measured: Measured) -> None:
+        """Keep a finished cell; what cannot be written (a full disk) is kept in memory."""
+        if key is None:
+            return
+        name = cell_name(key)
+        if self.folder is not None and not self.trouble:
+            try:
+                write_cell(self.folder / name, key, measured)
+            except OSError as error:
+                self.trouble = (
+                    f"finished work cannot be kept in {self.folder} ({error}); it goes on without"
+                )
+            else:
+                return
+        self._memory[name] = measured
+
+    def foreign(self) -> int:
+        """How many cells are there that nothing asked for so far: other options or versions."""
+        if self.folder is None or not self.folder.is_dir():
+            return 0
+        return sum(path.name not in self._asked for path in self.folder.glob("*.npz"))
+
+
+def cell_name(key: dict[str, Any]) -> str:
+    """File name of a cell: a digest of its key."""
+    return hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:32] + ".npz"
+
+
+def write_cell(path: Path, key: dict[str, Any], measured: Measured) -> None:
+    """Write a cell; a reader sees all of it or nothing.
+
+    Raises:
+        OSError: if it cannot be written; nothing is left then.
+    """
+    scalars = {field: getattr(measured, field) for field in _SCALARS}
+    content = io.BytesIO()
+    arrays: dict[str, Any] = {
+        "header": np.array(json.dumps({"key": key, **scalars})),
+        **measured.metrics.to_dict(),
+    }
+    np.savez(content, **arrays)
+    write_atomically(path, content.getvalue())
+
+
+def read_cell(path: Path, key: dict[str, Any]) -> Measured | None:
+    """The cell at `path`, or None if there is none, its key differs, or the file is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            header = json.loads(str(data["header"]))
+            if header["key"] != json.loads(json.dumps(key)):
+                return None
+            metrics = EpisodeMetrics(**{field: data[field] for field in FIELDS})
+        return Measured(metrics=metrics, **{field: header[field] for field in _SCALARS})
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        return None

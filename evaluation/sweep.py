@@ -1,0 +1,166 @@
+"""Many rows in many worlds: cut into cells, those that are missing computed, all put together.
+
+A job is one controller in one world. Its episodes are cut into cells whose size does not depend
+on the workers, so what one run finished any other can use. Cells of all jobs are handed out
+together: the last slow row does not wait for the rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from slipcar.envs.scenario import Scenario
+from slipcar.evaluation.cells import Store, cell_key, cell_size
+from slipcar.evaluation.controller import Controller
+from slipcar.evaluation.executors import Executor, Outcome, run
+from slipcar.evaluation.metrics import Result
+from slipcar.evaluation.progress import Bars
+from slipcar.evaluation.rollout import Measured, Stretch, joined, measure
+
+#: Seconds that 1024 episodes of a row may take; a hundred times what a receding horizon needs.
+TIME_LIMIT = 300.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One controller in one world.
+
+    Attributes:
+        row: name of the row, and of the progress bar.
+        variant: which world, or which training, of several in a row.
+        controller: who drives; or a function of the scenario that makes it, with `fingerprint()`
+            if finished work is to be reused: then workers plan.
+        scenario: where.
+        episodes: how many, >= 1.
+        seed: of the Brownian paths.
+        substeps: Euler–Maruyama steps in each control interval.
+        time_limit: seconds that 1024 episodes may take; None is no limit.
+    """
+
+    row: str
+    variant: str
+    controller: Controller | Callable[[Scenario], Controller]
+    scenario: Scenario
+    episodes: int
+    seed: int
+    substeps: int = 1
+    time_limit: float | None = TIME_LIMIT
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Row and variant."""
+        return self.row, self.variant
+
+    def stretches(self) -> list[Stretch]:
+        """Its episodes in cells; a controller that is made in the worker is made only once."""
+        made_there = not callable(getattr(self.controller, "predict", None))
+        size = self.episodes if made_there else cell_size(self.controller)
+        return [
+            Stretch(
+                controller=self.controller,
+                scenario=self.scenario,
+                first=first,
+                episodes=min(size, self.episodes - first),
+                seed=self.seed,
+                substeps=self.substeps,
+                time_limit=self.time_limit,
+            )
+            for first in range(0, self.episodes, size)
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Swept:
+    """What came of jobs.
+
+    Attributes:
+        results: (row, variant) -> result, of the jobs that finished.
+        errors: (row, variant) -> message, of those that raised.
+        reused: jobs of which every cell was there before.
+        computed: cells that were computed.
+    """
+
+    results: dict[tuple[str, str], Result]
+    errors: dict[tuple[str, str], str]
+    reused: frozenset[tuple[str, str]]
+    computed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _Piece:
+    """A cell of a job, on its way through the workers."""
+
+    job: tuple[str, str]
+    index: int
+    key: dict[str, Any] | None
+    stretch: Stretch
+
+
+def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> Swept:
+    """Do jobs: take what the store has, compute the rest, and keep each cell as it finishes.
+
+    A job that raises becomes an error, the others go on.
+
+    Raises:
+        LostWorkersError: if the cluster is gone; what was finished is in the store.
+    """
+    done: dict[tuple[str, str], dict[int, Measured]] = {job.name: {} for job in jobs}
+    counts: dict[tuple[str, str], int] = {}
+    errors: dict[tuple[str, str], str] = {}
+    missing: list[_Piece] = []
+    for job in jobs:
+        stretches = job.stretches()
+        counts[job.name] = len(stretches)
+        for index, stretch in enumerate(stretches):
+            key = cell_key(stretch)
+            found = store.get(key)
+            if found is None:
+                missing.append(_Piece(job.name, index, key, stretch))
+            else:
+                done[job.name][index] = found
+                bars.advance(job.row, stretch.episodes)
+    reused = frozenset(name for name, cells in done.items() if len(cells) == counts[name])
+
+    def wanted() -> Iterator[_Piece]:
+        for piece in missing:
+            if piece.job not in errors:
+                yield piece
+
+    computed = 0
+    for piece, measured, error in _computed(wanted(), executor):
+        row, _ = piece.job
+        if error is not None:
+            if piece.job not in errors:
+                errors[piece.job] = message(error)
+                bars.note(row, "failed")
+            continue
+        computed += 1
+        done[piece.job][piece.index] = measured
+        store.put(piece.key, measured)
+        bars.advance(row, piece.stretch.episodes)
+    results = {
+        job.name: joined(
+            [done[job.name][index] for index in range(counts[job.name])],
+            job.scenario,
+            job.seed,
+            job.substeps,
+        )
+        for job in jobs
+        if job.name not in errors
+    }
+    return Swept(results, errors, reused, computed)
+
+
+def _computed(pieces: Iterator[_Piece], executor: Executor) -> Iterator[Outcome]:
+    return run(_measured, pieces, executor)
+
+
+def _measured(piece: _Piece) -> Measured:
+    return measure(piece.stretch)
+
+
+def message(error: BaseException) -> str:
+    """An error in one line, with what was noted on its way."""
+    return "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
