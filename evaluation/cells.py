@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.baselines import Policy
-from slipcar.baselines.files import write_atomically
+from slipcar.baselines.files import remove_leftovers, write_atomically
 from slipcar.evaluation.metrics import FIELDS, EpisodeMetrics
 from slipcar.evaluation.noise import BLOCK
 from slipcar.evaluation.provenance import code_digest, versions
@@ -110,6 +110,9 @@ class Store:
         self.folder = None if folder is None else Path(folder) / "cells"
         self.resume = resume
         self.trouble = ""
+        if folder is not None and self.folder is not None:
+            remove_leftovers(Path(folder))
+            remove_leftovers(self.folder)
         self._memory: dict[str, Measured] = {}
         self._asked: set[str] = set()
 

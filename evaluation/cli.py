@@ -13,16 +13,21 @@ from collections.abc import Callable, Sequence
 #: name -> (module, function, what `slipcar --help` says). Imported when asked for, because
 #: help should not take a second.
 COMMANDS = {
-    "compare": ("cli_compare", "compare", "the table and figures: SCP, feedback and PPO"),
+    "compare": ("cli_compare", "compare", "tables and figures: planners and policies, in suites"),
     "dataset": ("cli_dataset", "dataset", "write episodes of any controller as a Minari dataset"),
     "frontier": ("cli_frontier", "frontier", "what safety costs: effort against collision rate"),
     "plan": ("cli_plan", "plan", "plan one scenario: iterations, certificate, figures"),
+    "report": ("cli_report", "report", "one page of all results: tables, figures, animations"),
+    "reproduce": ("cli_reproduce", "reproduce", "the paper's claims, one by one, by numbers"),
     "simulate": ("cli_simulate", "simulate", "drive a few episodes; show, draw or film them"),
-    "train": ("cli_train", "train", "train the PPO baseline on a scenario"),
+    "train": ("cli_train", "train", "train a policy: PPO and others, on a scenario or a family"),
 }
 _DESCRIPTION = """Stochastic SCP, a slipping car, and an honest comparison with PPO.
 
-    slipcar compare                      the paper's scenario, ten controllers, figures
+    slipcar compare                      the paper's scenario: all methods, figures
+    slipcar compare --suite random       100 worlds that nobody was trained or tuned on
+    slipcar reproduce                    the paper's claims and what we get
+    slipcar report results               one page of it all
     slipcar frontier                     the price of safety: three curves, PPO, the paper
     slipcar plan --figures figures       one plan, what it proves, figures
     slipcar COMMAND --help               every option of a command"""

@@ -13,7 +13,7 @@ from slipcar.envs.scenario import Scenario
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from slipcar.evaluation.rollout import Controller
+    from slipcar.evaluation.controller import Controller
 
 _SCENARIO_HELP = (
     "which world: one of "
@@ -30,6 +30,10 @@ OwnScenarioOption = Annotated[
         help=_SCENARIO_HELP + "; by default the one a stored plan or a policy was made for, "
         "and paper for the others",
     ),
+]
+PaperScenarioOption = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="NAME|FILE", help=_SCENARIO_HELP + "; the suite paper's alone (paper)"),
 ]
 
 #: Words for controllers, and what each is.
@@ -93,7 +97,7 @@ def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, S
         OSError: if the file cannot be read.
     """
     from slipcar import baselines
-    from slipcar.evaluation.rows import chargeable
+    from slipcar.evaluation.makers import chargeable
     from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
 
     path = Path(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +52,7 @@ def compare(
     folder: str | Path | None = None,
     resume: bool = True,
     time_limit: float | None = TIME_LIMIT,
+    notes: Sequence[str] = (),
     progress: bool = True,
 ) -> Comparison:
     """Evaluate every controller over the same Brownian paths.
@@ -80,6 +81,7 @@ def compare(
         resume: whether to reuse finished work of `folder`.
         time_limit: seconds that a row may take for 1024 episodes before it counts as failed; None
             is no limit.
+        notes: what readers of the table must be told besides; they come first in `warnings`.
         progress: whether to show a bar for each row.
 
     Raises:
@@ -126,7 +128,7 @@ def compare(
             with Bars(expected(), progress) as bars:
                 swept = sweep(jobs(), store, executor, bars)
             results, errors = _rows(controllers, swept)
-    warnings = [store.trouble] if store.trouble else []
+    warnings = [*notes, store.trouble] if store.trouble else [*notes]
     if resolution is not None:
         warnings += _too_wide(results, resolution)
     reused = {

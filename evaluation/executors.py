@@ -16,6 +16,7 @@ import contextlib
 import dataclasses
 import itertools
 import logging
+import os
 import threading
 import time
 from collections import deque
@@ -165,8 +166,11 @@ def _guarded(work: Callable[[Any], Any], task: Any) -> Any:
     Dask workers may have several threads, but BLAS limits and planners' workspaces are the
     process's.
     """
-    with _alone, one_thread():
-        return work(task)
+    with _alone:
+        for name, value in ENVIRONMENT.items():  # what a task may still import, torch say
+            os.environ.setdefault(name, value)
+        with one_thread():
+            return work(task)
 
 
 @contextlib.contextmanager

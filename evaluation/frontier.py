@@ -22,9 +22,11 @@ import numpy as np
 from slipcar import baselines
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import checked_int
-from slipcar.evaluation import rows
+from slipcar.evaluation import makers, rows
 from slipcar.evaluation.compare import Comparison, compare
-from slipcar.evaluation.rollout import Controller, check_counts
+from slipcar.evaluation.controller import Controller
+from slipcar.evaluation.rollout import check_counts
+from slipcar.evaluation.runs import Runs
 from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan
 
 if TYPE_CHECKING:
@@ -55,7 +57,7 @@ class Point:
     name: str
     method: str
     price: float
-    controller: Controller
+    controller: Controller | Runs
 
 
 def frontier(
@@ -154,7 +156,7 @@ def candidates(
     """The points, and what a reader must be told; plans that did not converge are left out."""
     scenario.action_scale  # noqa: B018  raises now if it is unbounded
     notes: list[str] = []
-    weight = rows.chargeable(scenario)
+    weight = makers.chargeable(scenario)
     # So that planning times are warm ones, without first-call costs.
     plan(scenario, variance_weight=weight)
     plan(scenario, feedback=True)
@@ -167,7 +169,7 @@ def candidates(
     ]
     for name, found in ((rows.DETERMINISTIC, deterministic), (rows.STOCHASTIC, stochastic)):
         notes += rows.plan_notes(name, found)
-    for name, controller in rows.ppo_row(scenario, policy, notes).items():
+    for name, controller in rows.learned(scenario, policy, notes, ("ppo",)).items():
         points.append(Point(name, SINGLE, float("nan"), controller))
     kinds: tuple[tuple[str, Callable[..., Controller], bool], ...] = (
         (OPEN_LOOP, OpenLoop, False),

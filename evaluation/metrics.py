@@ -141,6 +141,8 @@ class Result:
     def of_runs(cls, runs: Sequence[Result]) -> Result:
         """One row for several trainings of a method, all over the same paths."""
         first = runs[0]
+        if len(runs) == 1:
+            return first
         return cls(
             metrics=EpisodeMetrics.concatenate([run.metrics for run in runs]),
             seed=first.seed,

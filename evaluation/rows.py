@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from slipcar import baselines
 from slipcar.envs.scenario import Scenario
-from slipcar.evaluation.rollout import Controller
+from slipcar.evaluation.controller import Controller
+from slipcar.evaluation.learned import learned_rows, trainings
+from slipcar.evaluation.makers import chargeable
+from slipcar.evaluation.runs import Runs
 from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
 
 STRAIGHT = "straight (ignores obstacles)"
@@ -30,20 +33,21 @@ def default_rows(
     *,
     variance_weight: float = 1.0,
     policy: Controller | None = None,
-) -> tuple[dict[str, Controller], list[str]]:
+) -> tuple[dict[str, Controller | Runs], list[str]]:
     """Controllers by name, in the order of the table, and what a reader must be told of them.
 
     A straight-line driver that ignores obstacles, deterministic SCP and stochastic SCP in open
-    loop, stochastic SCP with feedback, PPO; then what goes beyond the paper: a chance-constrained
-    plan in open loop, plans whose feedback is planned along, without and with a bound on their
-    risk, and receding horizons without and with the price of risk that bound led to. The shipped
-    policy knows one scenario only: on another its row is left out, and a note says so.
+    loop, stochastic SCP with feedback, PPO and what else was learned; then what goes beyond the
+    paper: a chance-constrained plan in open loop, plans whose feedback is planned along, without
+    and with a bound on their risk, and receding horizons without and with the price of risk that
+    bound led to. The shipped policies know one scenario only: on another their rows are left out,
+    and a note says so.
 
     Args:
         scenario: a scenario or the name of one.
         variance_weight: of stochastic SCP; the rows beyond the paper charge what the noise is
             expected to cost, and need none.
-        policy: the PPO row; None takes the shipped one.
+        policy: the only learned row; None takes all that are shipped.
 
     Raises:
         ValueError: for a scenario that cannot be driven or planned.
@@ -61,7 +65,7 @@ def default_rows(
     plan(scenario, variance_weight=weight)
     deterministic = baselines.deterministic_scp(scenario)
     stochastic = plan(scenario, variance_weight=weight)
-    rows: dict[str, Controller] = {
+    rows: dict[str, Controller | Runs] = {
         STRAIGHT: baselines.straight(scenario),
         DETERMINISTIC: OpenLoop(deterministic),
         STOCHASTIC: OpenLoop(stochastic),
@@ -69,32 +73,38 @@ def default_rows(
     }
     for name, found in ((DETERMINISTIC, deterministic), (STOCHASTIC, stochastic)):
         notes += plan_notes(name, found)
-    rows |= ppo_row(scenario, policy, notes)
+    rows |= learned(scenario, policy, notes)
     rows |= _beyond_the_paper(scenario, notes)
     return rows, notes
 
 
-def chargeable(scenario: Scenario, variance_weight: float = 1.0) -> float:
-    """The weight itself, or 0 where the slip depends on states that are uncertain (§6.1)."""
-    uncertain = scenario.process_noise[3:].any() or scenario.start_deviation[3:].any()
-    return 0.0 if uncertain else variance_weight
+def learned(
+    scenario: Scenario,
+    policy: Controller | None,
+    notes: list[str],
+    methods: tuple[str, ...] | None = None,
+) -> dict[str, Controller | Runs]:
+    """Rows of learned methods: what is shipped for this scenario, or the policy that is given.
 
-
-def ppo_row(
-    scenario: Scenario, policy: Controller | None, notes: list[str]
-) -> dict[str, Controller]:
-    """The policy as a row, if it was trained on this scenario or given; `notes` are added to."""
-    known = baselines.load_policy() if policy is None else policy
-    trained_here = getattr(known, "scenario", scenario) == scenario
-    if policy is None and not trained_here:
+    Args:
+        scenario: where they are to drive.
+        policy: takes the place of all that is shipped; or None.
+        notes: what a reader must be told is added to it.
+        methods: which of the shipped ones; None is all.
+    """
+    if policy is not None:
+        if getattr(policy, "scenario", scenario) != scenario:
+            notes.append(f"{PPO}: the policy was trained on another scenario.")
+        return {PPO: policy}
+    if baselines.load_policy().scenario != scenario:
         notes.append(
-            f"No {PPO} row: the shipped policy was trained on another scenario. Train one with "
+            f"No {PPO} row: the shipped policies were trained on another scenario. Train one with "
             "`slipcar train --scenario ...` and pass it with --policy."
         )
         return {}
-    if not trained_here:
-        notes.append(f"{PPO}: the policy was trained on another scenario.")
-    return {PPO: known}
+    rows: dict[str, Controller | Runs] = {**learned_rows("paper", methods)}
+    notes += trainings(rows)
+    return rows
 
 
 def plan_notes(name: str, found: Plan) -> list[str]:

@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from slipcar.evaluation.statistics import paired_difference, standard_error, wilson_interval
+from slipcar.evaluation.statistics import (
+    bca_interval,
+    cvar,
+    episodes_for,
+    half_width,
+    paired_difference,
+    standard_error,
+    student_interval,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 10), (1, 10), (60, 1000), (596, 10_000), (10, 10)])
@@ -79,3 +88,92 @@ def test_one_episode_has_no_interval():
 def test_rows_of_different_length_are_refused():
     with pytest.raises(ValueError, match=r"\(3,\) and \(4,\)"):
         paired_difference(np.zeros(3), np.zeros(4))
+
+
+# ------------------------------------------------------------------ the bootstrap
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_bca_is_that_of_scipy(seed):
+    from scipy import stats
+
+    values = np.random.default_rng(seed).lognormal(size=150)
+    found = bca_interval(values, resamples=60_000, seed=3)
+    theirs = stats.bootstrap(
+        (values,), np.mean, n_resamples=30_000, batch=1000, method="BCa", rng=4
+    ).confidence_interval
+    width = theirs.high - theirs.low
+    assert found.low == pytest.approx(theirs.low, abs=0.025 * width)
+    assert found.high == pytest.approx(theirs.high, abs=0.025 * width)
+
+
+def test_bca_covers_a_skewed_mean_where_the_normal_interval_does_not():
+    rng = np.random.default_rng(5)
+    truth, misses = np.exp(0.5), {"bca": 0, "normal": 0}
+    for i in range(250):
+        values = rng.lognormal(size=40)
+        _, _, high = bca_interval(values, resamples=600, seed=i)
+        half = 1.96 * standard_error(values)
+        misses["bca"] += truth > high
+        misses["normal"] += truth > values.mean() + half
+    assert misses["bca"] < misses["normal"]
+
+
+def test_groups_of_neighbours_stand_for_the_sample(monkeypatch):
+    from slipcar.evaluation import statistics
+
+    values = np.random.default_rng(6).lognormal(size=30_000)
+    exact = bca_interval(values, resamples=3000, seed=0)
+    monkeypatch.setattr(statistics, "UNGROUPED", 1000)
+    grouped = bca_interval(values, resamples=3000, seed=1)
+    assert grouped.mean == exact.mean
+    width = exact.high - exact.low
+    assert grouped.low == pytest.approx(exact.low, abs=0.06 * width)
+    assert grouped.high == pytest.approx(exact.high, abs=0.06 * width)
+
+
+def test_a_shift_and_a_factor_go_through_the_interval():
+    values = np.random.default_rng(7).exponential(size=500)
+    one, other = bca_interval(values), bca_interval(3.0 * values + 2.0)
+    np.testing.assert_allclose(other, 3.0 * np.array(one) + 2.0, rtol=1e-9)
+
+
+# ------------------------------------------------------------------ tails
+
+
+def test_cvar_of_a_normal_sample():
+    from scipy import stats
+
+    values = np.random.default_rng(8).normal(size=100_000)
+    mean, error = cvar(values, 0.05)
+    expected = stats.norm.pdf(stats.norm.ppf(0.95)) / 0.05
+    assert mean == pytest.approx(expected, abs=3.0 * error)
+    blocks = [cvar(part, 0.05)[0] for part in values.reshape(100, -1)]
+    assert error == pytest.approx(np.std(blocks) / 10.0, rel=0.25)
+
+
+def test_cvar_of_few_and_of_infinite_values():
+    assert cvar(np.array([1.0, 2.0, 3.0, 10.0]), 0.25)[0] == 10.0
+    assert cvar(np.arange(1.0, 101.0), 0.05)[0] == pytest.approx(98.0)
+    assert cvar(np.array([np.inf, np.inf]), 0.05)[0] == np.inf
+
+
+# ------------------------------------------------------------------ how many episodes
+
+
+@pytest.mark.parametrize(("resolution", "rate"), [(0.001, 0.06), (0.01, 0.5), (0.002, 0.0)])
+def test_episodes_for_a_resolution_are_just_enough(resolution, rate):
+    n = episodes_for(resolution, rate)
+    assert half_width(rate, n) <= resolution < half_width(rate, n - 1)
+
+
+@pytest.mark.parametrize(("resolution", "rate"), [(0.0, 0.1), (0.5, 0.1), (0.1, 1.5)])
+def test_bad_resolutions_are_named(resolution, rate):
+    with pytest.raises(ValueError, match="must be between"):
+        episodes_for(resolution, rate)
+
+
+def test_a_method_is_less_certain_than_its_trainings():
+    mean, low, high = student_interval(5.0, 0.1, freedom=4)
+    assert (mean - low, high - mean) == (pytest.approx(0.2776, rel=1e-3),) * 2
+    assert student_interval(5.0, 0.1, freedom=0).high == pytest.approx(5.196, rel=1e-4)
