@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -44,6 +45,11 @@ def cells(folder: Path) -> dict[str, bytes]:
     return found
 
 
+def same_tables(one: Path, other: Path) -> None:
+    for name in TABLES:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), f"{name} differs"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--kills", type=int, default=20)
@@ -56,10 +62,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         calm, killed = Path(place) / "calm", Path(place) / "killed"
         began = time.monotonic()
-        subprocess.run(command(calm, arguments), check=True, capture_output=True)
+        subprocess.run(command(calm, arguments), check=True, stdout=subprocess.DEVNULL)
         whole = time.monotonic() - began
         began = time.monotonic()
-        subprocess.run(command(calm, arguments), check=True, capture_output=True)
+        subprocess.run(command(calm, arguments), check=True, stdout=subprocess.DEVNULL)
         idle = time.monotonic() - began
         print(
             f"undisturbed: {whole:.1f} s, {len(cells(calm))} cells; {idle:.1f} s to find them all "
@@ -67,7 +73,8 @@ def main() -> int:
             flush=True,
         )
         before: dict[str, bytes] = {}
-        for kill in range(1, options.kills + 1):
+        kill = 0
+        while kill < options.kills:
             run = subprocess.Popen(
                 command(killed, arguments),
                 stdout=subprocess.DEVNULL,
@@ -78,20 +85,24 @@ def main() -> int:
             wait = idle * rng.uniform(0.3, 1.0) + rng.uniform(0.0, 3.0 * whole / options.kills)
             try:
                 run.wait(timeout=wait)
-                moment = "after it had finished"
             except subprocess.TimeoutExpired:
                 os.killpg(run.pid, signal.SIGKILL)
                 run.wait()
-                moment = f"after {wait:.1f} s"
+            else:  # it was done before: what it made must be right, and all begins anew
+                same_tables(calm, killed)
+                shutil.rmtree(killed)
+                before = {}
+                print("finished, the same tables; once more from nothing", flush=True)
+                continue
+            kill += 1
             now = cells(killed)
             lost = [name for name in before if now.get(name) != before[name]]
             assert not lost, f"kill {kill}: lost or changed {lost}"
-            print(f"kill {kill}, {moment}: {len(now)} cells, none lost", flush=True)
+            print(f"kill {kill}, after {wait:.1f} s: {len(now)} cells, none lost", flush=True)
             before = now
-        subprocess.run(command(killed, arguments), check=True, capture_output=True)
+        subprocess.run(command(killed, arguments), check=True, stdout=subprocess.DEVNULL)
         assert all(cells(killed)[name] == content for name, content in before.items())
-        for name in TABLES:
-            assert (calm / name).read_bytes() == (killed / name).read_bytes(), f"{name} differs"
+        same_tables(calm, killed)
         left = [str(path) for path in killed.rglob(".*")]
         assert not left, f"half-written files: {left}"
         print(f"{', '.join(TABLES)}: the same bytes; no half-written file")

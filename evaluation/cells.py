@@ -61,6 +61,8 @@ def cell_key(stretch: Stretch) -> dict[str, Any] | None:
 
 def _software(controller: Any) -> dict[str, Any]:
     """Source and library versions that a controller's numbers depend on."""
+    parts: tuple[str, ...]
+    packages: tuple[str, ...]
     if isinstance(controller, Policy):
         parts, packages = ("envs", "policy", "core"), ("numpy",)
     elif type(controller).__module__.startswith("slipcar.planner."):

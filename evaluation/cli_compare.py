@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from slipcar.evaluation.cli_inputs import PaperScenarioOption, console, read_scenario
+from slipcar.evaluation.cli_inputs import PaperScenarioOption, console, read_maker, read_scenario
 from slipcar.evaluation.executors import LostWorkersError
 
 if TYPE_CHECKING:
@@ -161,19 +161,18 @@ def _paper(
     from slipcar.baselines import load_policy
     from slipcar.evaluation import compare as compare_controllers
     from slipcar.evaluation import report
-    from slipcar.evaluation.own_controllers import load_controller
     from slipcar.evaluation.rows import REFERENCE, default_rows
 
     world = read_scenario(scenario)
-    own = dict(load_controller(text, world, trust=trust) for text in controllers)
+    own = dict(read_maker(text, trust) for text in controllers)
     rows, notes = default_rows(
         world,
         variance_weight=variance_weight,
         policy=None if policy is None else load_policy(policy),
     )
     check_names(list(rows), list(own), len(controllers))
-    done = compare_controllers(rows | own, world, reference=REFERENCE, notes=notes, **options)
-    out.print(report.document(done).terminal())
+    done = compare_controllers({**rows, **own}, world, reference=REFERENCE, notes=notes, **options)
+    out.print(report.terminal(done))
     with out.status("writing tables and drawing figures ..."):
         written = done.save(options["folder"], figures=figures)
     _say_written(out, options["folder"], written)
@@ -193,14 +192,11 @@ def _suite(
     import dataclasses
     import importlib
 
-    from slipcar.envs.scenario import Scenario
-    from slipcar.evaluation.own_controllers import load_controller
-    from slipcar.evaluation.suites import Own, run_suite, save_suite
+    from slipcar.evaluation.suites import run_suite, save_suite
 
     module = importlib.import_module(f"slipcar.evaluation.suite_{suite}")
     chosen = module.suite() if episodes is None else module.suite(episodes)
-    paper = Scenario.named("paper")  # whatever is wrong with them, before anything is run
-    own = {load_controller(text, paper, trust=trust)[0]: Own(text, trust) for text in controllers}
+    own = dict(read_maker(text, trust) for text in controllers)
     check_names(list(chosen.rows), list(own), len(controllers))
     result = run_suite(dataclasses.replace(chosen, rows={**chosen.rows, **own}), seed, **common)
     document: Document = module.document(result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import tyro
 
 from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
+from slipcar.evaluation.makers import Maker
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -46,9 +48,18 @@ CONTROLLERS = {
     "straight": "straight line, ignores obstacles",
     "ppo": "PPO, the shipped policy",
 }
+MAKERS = {
+    "scp": Maker.of("stochastic"),
+    "feedback": Maker.of("feedback"),
+    "planned-feedback": Maker.of("planned-feedback"),
+    "receding": Maker.of("receding"),
+    "deterministic": Maker.of("deterministic"),
+    "straight": Maker.of("straight"),
+}
 CONTROLLER_HELP = (
-    f"who drives: {', '.join(CONTROLLERS)}; or a plan's .npz file (with its feedback gains if it "
-    "has some), or a policy's .safetensors file or folder"
+    f"who drives: {', '.join(CONTROLLERS)}; a plan's .npz file (with its feedback gains if it has "
+    "some), a policy's .safetensors file or folder; or your own: module:object, file.py:object, a "
+    "Stable-Baselines3 model.zip (with --trust), or the name of an installed one"
 )
 
 
@@ -83,29 +94,33 @@ def read_scenario(text: str) -> Scenario:
     return Scenario.named(text)
 
 
-def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, Scenario]:
+def read_controller(
+    text: str, scenario: Scenario | None, trust: bool = False
+) -> tuple[Controller, Scenario]:
     """The controller that a word of the command line means, and the scenario it is to drive.
 
     Args:
-        text: one of :data:`CONTROLLERS`, a plan's .npz file, or a policy's .safetensors or
-            .json file or folder.
+        text: one of :data:`CONTROLLERS`, a plan's .npz file, a policy's .safetensors or .json file
+            or folder, or one's own (:mod:`slipcar.evaluation.own_controllers`).
         scenario: where it drives; None is the one a stored plan or a policy was made for, and
             the paper's for the others.
+        trust: whether a Stable-Baselines3 model may be loaded, which runs what code is in it.
 
     Raises:
         ValueError: for an unknown word or a bad file.
         OSError: if the file cannot be read.
     """
     from slipcar import baselines
-    from slipcar.evaluation.makers import chargeable
-    from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
+    from slipcar.evaluation.own_controllers import load_controller
+    from slipcar.planner import Feedback, OpenLoop, Plan
 
-    path = Path(text)
-    # A word is the controller, also where a folder happens to have its name.
-    stored_policy = path.suffix in (".safetensors", ".json") or path.is_dir()
-    if text == "ppo" or (text not in CONTROLLERS and stored_policy):
-        policy = baselines.load_policy(None if text == "ppo" else path)
+    if text == "ppo":
+        policy = baselines.load_policy()
         return policy, scenario or policy.scenario
+    if text in MAKERS:
+        world = scenario or Scenario.named("paper")
+        return MAKERS[text](world), world
+    path = Path(text)
     if path.suffix == ".npz":
         stored = Plan.load(path)
         made_for = stored.problem if isinstance(stored.problem, Scenario) else None
@@ -113,23 +128,26 @@ def read_controller(text: str, scenario: Scenario | None) -> tuple[Controller, S
         # A plan plays its own controls; the world it is played in says how actions scale.
         stored = stored.replace(problem=world)
         return (OpenLoop(stored) if stored.gains is None else Feedback(stored)), world
+    if path.suffix in (".safetensors", ".json") or (path.is_dir() and ":" not in text):
+        policy = baselines.load_policy(path)
+        return policy, scenario or policy.scenario
     world = scenario or Scenario.named("paper")
-    if text == "scp":
-        return OpenLoop(plan(world, variance_weight=chargeable(world))), world
-    if text == "feedback":
-        return Feedback(plan(world, variance_weight=chargeable(world))), world
-    if text == "planned-feedback":
-        return Feedback(plan(world, feedback=True)), world
-    if text == "receding":
-        return RecedingHorizon(world), world
-    if text == "deterministic":
-        return OpenLoop(baselines.deterministic_scp(world)), world
-    if text == "straight":
-        return baselines.straight(world), world
-    raise ValueError(
-        f"unknown controller {text!r}: it is one of {list(CONTROLLERS)}, a plan's .npz file, or a "
-        "policy's .safetensors file or folder"
-    )
+    return load_controller(text, world, trust=trust)[1], world
+
+
+def read_maker(text: str, trust: bool = False) -> tuple[str, Callable[[Scenario], Controller]]:
+    """Name of a row, and what makes its controller for any scenario: `--controller` of a table.
+
+    Raises:
+        ValueError: if there is no such word, module, object or file.
+        OSError: if a file cannot be read.
+    """
+    from slipcar.evaluation.own_controllers import load_maker, split_name
+
+    name, word = split_name(text)
+    if word in MAKERS:
+        return name or word, MAKERS[word]
+    return load_maker(text, trust=trust)
 
 
 def console(width: int = 120) -> Console:

@@ -14,6 +14,7 @@ from slipcar.envs.validate import checked_float
 from slipcar.evaluation.cells import Store
 from slipcar.evaluation.controller import Controller, check_controller
 from slipcar.evaluation.executors import open_executor
+from slipcar.evaluation.limits import time_limit
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.noise import BLOCK
 from slipcar.evaluation.progress import Bars
@@ -21,7 +22,8 @@ from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts, evaluate
 from slipcar.evaluation.runs import Runs
 from slipcar.evaluation.statistics import episodes_for, half_width
-from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, sweep
+from slipcar.evaluation.suites import Row
+from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, message, sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +41,7 @@ PILOT, MOST = 8 * BLOCK, 4096 * BLOCK
 
 
 def compare(
-    controllers: Mapping[str, Controller | Runs],
+    controllers: Mapping[str, Row],
     scenario: Scenario | str,
     episodes: int | None = None,
     seed: int = 0,
@@ -64,8 +66,9 @@ def compare(
     nor the cluster, to the last bit.
 
     Args:
-        controllers: name -> controller, or :class:`slipcar.evaluation.runs.Runs` for a learned
-            method with several trainings; in the order of the table.
+        controllers: name -> controller; or :class:`slipcar.evaluation.runs.Runs` for a learned
+            method with several trainings; or a function of the scenario that makes a controller.
+            In the order of the table.
         scenario: a scenario or the name of one.
         episodes: a row, >= 1; None is 10 000, or what `resolution` needs.
         seed: of the Brownian paths, >= 0.
@@ -101,40 +104,39 @@ def compare(
     for name, controller in controllers.items():
         if not isinstance(name, str) or not name.strip():
             raise ValueError(f"a row's name must be a non-empty string, not {name!r}")
-        if not isinstance(controller, Runs):
+        if not isinstance(controller, Runs) and not _is_maker(controller):
             check_controller(controller)
     chosen = _reference(list(controllers), reference)
     began = time.perf_counter()
     store = Store(folder, resume)
-    counts = dict.fromkeys(controllers, PILOT if fixed is None else fixed)
-    trained = {name: len(_trainings(controller)) for name, controller in controllers.items()}
+    rows, unmade = _made(controllers, scenario, time_limit)
+    counts = dict.fromkeys(rows, PILOT if fixed is None else fixed)
+    trained = {name: len(_trainings(controller)) for name, controller in rows.items()}
 
     def jobs() -> list[Job]:
         return [
             Job(name, label, one, scenario, counts[name], seed, substeps, time_limit)
-            for name, controller in controllers.items()
+            for name, controller in rows.items()
             for label, one in _trainings(controller).items()
         ]
 
     def expected() -> dict[str, int]:
-        return {name: counts[name] * trained[name] for name in controllers}
+        return {name: counts[name] * trained[name] for name in rows}
 
     with open_executor(n_jobs, cluster) as executor:
         with Bars(expected(), progress) as bars:
             swept = sweep(jobs(), store, executor, bars)
-        results, errors = _rows(controllers, swept)
+        results, errors = _rows(rows, swept)
         if fixed is None and resolution is not None:
             counts |= {name: needed(resolution, row) for name, row in results.items()}
             with Bars(expected(), progress) as bars:
                 swept = sweep(jobs(), store, executor, bars)
-            results, errors = _rows(controllers, swept)
+            results, errors = _rows(rows, swept)
     warnings = [*notes, store.trouble] if store.trouble else [*notes]
     if resolution is not None:
         warnings += _too_wide(results, resolution)
     reused = {
-        name
-        for name in results
-        if all((name, v) in swept.reused for v in _trainings(controllers[name]))
+        name for name in results if all((name, v) in swept.reused for v in _trainings(rows[name]))
     }
     if folder is not None and resume and swept.computed and (others := store.foreign()):
         warnings.append(
@@ -143,18 +145,42 @@ def compare(
         )
     return Comparison(
         scenario=scenario,
-        episodes=max((row.episodes for row in results.values()), default=max(counts.values())),
+        episodes=max((row.episodes for row in results.values()), default=0),
         seed=seed,
         substeps=substeps,
         reference=chosen,
-        controllers=dict(controllers),
+        controllers={name: rows.get(name, controllers[name]) for name in controllers},
         results=results,
-        errors=errors,
+        errors=unmade | errors,
         reused=tuple(name for name in controllers if name in reused),
         warnings=tuple(warnings),
         wall_time=time.perf_counter() - began,
         provenance=provenance(),
     )
+
+
+def _is_maker(controller: Any) -> bool:
+    return callable(controller) and not callable(getattr(controller, "predict", None))
+
+
+def _made(
+    controllers: Mapping[str, Row], scenario: Scenario, limit: float | None
+) -> tuple[dict[str, Controller | Runs], dict[str, str]]:
+    """Rows that can be driven, and messages of those whose making failed."""
+    rows: dict[str, Any] = {}
+    errors: dict[str, str] = {}
+    for name, controller in controllers.items():
+        if isinstance(controller, Runs) or not _is_maker(controller):
+            rows[name] = controller
+            continue
+        try:
+            with time_limit(limit, "making the controller"):
+                rows[name] = controller(scenario)  # type: ignore[operator]
+            check_controller(rows[name])
+        except Exception as error:  # one bad row must not cost the others
+            rows.pop(name, None)
+            errors[name] = message(error)
+    return rows, errors
 
 
 def needed(resolution: float, row: Result) -> int:
@@ -230,7 +256,7 @@ class Comparison:
     seed: int
     substeps: int
     reference: str
-    controllers: dict[str, Controller | Runs]
+    controllers: dict[str, Any]
     results: dict[str, Result]
     errors: dict[str, str]
     reused: tuple[str, ...]

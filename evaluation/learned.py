@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from slipcar import baselines
 from slipcar.evaluation.runs import Runs
 
@@ -11,6 +9,7 @@ from slipcar.evaluation.runs import Runs
 NAMES = {
     "ppo": "PPO",
     "warm-started": "PPO after SCP data",
+    "cloned": "clone of SCP",
     "pathwise": "pathwise gradients",
     "sac": "SAC",
     "tqc": "TQC",
@@ -33,13 +32,3 @@ def learned_rows(world: str, methods: tuple[str, ...] | None = None) -> dict[str
         for method in shipped
         if methods is None or method in methods
     }
-
-
-def trainings(rows: Mapping[str, object]) -> list[str]:
-    """What a reader must be told of rows with several trainings."""
-    return [
-        f"{name}: mean over {len(runs.controllers)} trainings ({', '.join(runs.labels)}); its "
-        "errors and intervals are of the method, trainings and paths together."
-        for name, runs in rows.items()
-        if isinstance(runs, Runs) and len(runs.controllers) > 1
-    ]

@@ -14,12 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slipcar.evaluation.document import Column, Table, table_of
+from slipcar.evaluation.rows import FEEDBACK, STEERED, STOCHASTIC
 from slipcar.evaluation.runs import Runs
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from slipcar.evaluation.compare import Comparison
+
+#: Rows whose cost learners are measured by.
+TARGETS = (STOCHASTIC, FEEDBACK, STEERED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +59,11 @@ def curves(rows: Mapping[str, Any]) -> dict[str, list[Curve]]:
         if not isinstance(row, Runs):
             continue
         mine = [
-            _curve(label, policy.training["history"])
+            _curve(label, history)
             for label, policy in zip(row.labels, row.controllers, strict=True)
-            if getattr(policy, "training", {}).get("history")
+            if (history := getattr(policy, "training", {}).get("history"))
         ]
-        if mine:
+        if mine and min(len(curve.steps) for curve in mine) > 1:
             found[name] = mine
     return found
 
@@ -70,12 +74,15 @@ def _curve(label: str, history: list[dict[str, float]]) -> Curve:
 
 
 def targets(comparison: Comparison) -> dict[str, tuple[float, float]]:
-    """Name -> mean cost and planning time of the rows that plan, cheapest last."""
+    """Name -> mean cost and planning time of the plans to be reached, cheapest last.
+
+    The paper's plan, the same tracked by an LQR, and planned feedback, as far as there are such
+    rows.
+    """
     found = {
-        name: (result.total, result.preparation_time)
-        for name, result in comparison.results.items()
-        if not isinstance(comparison.controllers[name], Runs)
-        and getattr(comparison.controllers[name], "plan", None) is not None
+        name: (comparison.results[name].total, comparison.results[name].preparation_time)
+        for name in TARGETS
+        if name in comparison.results
     }
     return dict(sorted(found.items(), key=lambda item: -item[1][0]))
 

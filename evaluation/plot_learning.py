@@ -45,6 +45,8 @@ def learning_figure(comparison: Comparison) -> Figure:
                         va="center",
                         annotation_clip=False,
                     )
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axes.set_xlabel(label)
         lowest = min(
             [cost for cost, _ in plans.values()]
@@ -72,7 +74,7 @@ def _band(
     """Median and range over trainings on a common grid, as far as all of them go."""
     ends = [(getattr(curve, against)[0], getattr(curve, against)[-1]) for curve in mine]
     first, last = max(low for low, _ in ends), min(high for _, high in ends)
-    grid = np.linspace(first, last, 200)
+    grid = np.geomspace(first, last, 400)
     # What is best so far is what training keeps.
     every = np.array(
         [

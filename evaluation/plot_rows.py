@@ -18,9 +18,14 @@ if TYPE_CHECKING:
 
 #: More than there are colours, so that no two rows look the same.
 _MARKERS = "osD^vPX*ph"
+#: Of open and closed loop, while colours last and when they come round again.
+_LINES = (((0, (4, 2)), "-"), ((0, (1, 1.2)), (0, (7, 1.5, 1.5, 1.5))))
 #: Rows that cost more than this many times the cheapest are named beside the axes, not drawn:
 #: they would press all others into a corner.
 OFF_AXES = 5.0
+#: A distribution function is drawn through some so many points on a linear axis of shares, and on
+#: a logarithmic one: a file does not grow with the episodes.
+_MOST_DRAWN = 2000
 
 
 def _looks(comparison: Comparison) -> dict[str, dict[str, Any]]:
@@ -35,7 +40,7 @@ def _looks(comparison: Comparison) -> dict[str, dict[str, Any]]:
             "colour": colour,
             "marker": _MARKERS[i % len(_MARKERS)],
             "face": colour if result.closed_loop else PAPER,
-            "line": "-" if result.closed_loop else (0, (4, 2)),
+            "line": _LINES[i // len(PALETTE) % 2][result.closed_loop],
             "label": name if loop in name.lower() else f"{name}, {loop}",
             "drawn": result.total <= OFF_AXES * cheapest,
         }
@@ -91,7 +96,7 @@ def tradeoff_figure(comparison: Comparison) -> Figure:
         axes.set_xscale("log")
         axes.margins(0.12)
         _plain_log_ticks(axes.xaxis)
-        axes.set_xlabel(f"collision rate [%], Wilson {CONFIDENCE:.0%} interval")
+        axes.set_xlabel(f"collision rate [%], {CONFIDENCE:.0%} interval")
         axes.set_ylabel(f"mean cost of a path, {CONFIDENCE:.0%} interval")
         figure.legend(
             *axes.get_legend_handles_labels(),
@@ -123,11 +128,12 @@ def distributions_figure(comparison: Comparison) -> Figure:
             if not look["drawn"]:
                 left.plot([], [], label=_off_axes_label(look["label"], result), **line)
                 continue
-            costs = np.sort(result.metrics.total)
-            share = np.arange(1, len(costs) + 1) / len(costs)
+            count = len(result.metrics)
+            rank = drawn_ranks(count)
+            costs, share = np.sort(result.metrics.total)[rank], (rank + 1) / count
             left.step(costs, share, where="post", label=look["label"], **line)
             # Just before each jump, so that the largest cost is still on the axis.
-            right.step(costs, 1.0 - share + 1.0 / len(costs), where="pre", **line)
+            right.step(costs, 1.0 - share + 1.0 / count, where="pre", **line)
         left.set_ylabel("share of episodes that cost at most $c$")
         left.set_ylim(0.0, 1.0)
         right.set_ylabel("share of episodes that cost at least $c$")
@@ -140,3 +146,24 @@ def distributions_figure(comparison: Comparison) -> Figure:
             *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, handlelength=2.6
         )
     return figure
+
+
+def drawn_ranks(count: int) -> np.ndarray:
+    """Which of sorted numbers a distribution function is drawn through: all, unless they are many.
+
+    Of many, some two thousand evenly over the shares, and as many over the logarithm of what is
+    left above: a step is then less than a line's width on either axis, and the largest hundred are
+    there one by one.
+
+    Args:
+        count: how many numbers, >= 1.
+
+    Returns:
+        Ranks in rising order, the first 0 and the last `count` − 1.
+    """
+    if count <= 2 * _MOST_DRAWN:
+        return np.arange(count)
+    even = np.linspace(0, count - 1, _MOST_DRAWN)
+    above = count - np.geomspace(1, count, _MOST_DRAWN)
+    largest = np.arange(count - 100, count)
+    return np.unique(np.concatenate([even, above, largest]).round().astype(int))

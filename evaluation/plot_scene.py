@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from slipcar.baselines.files import write_atomically
 from slipcar.envs.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -65,13 +67,24 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+#: How each kind of file is written: without dates, so that equal figures are equal files.
+_SUFFIXES: dict[str, dict[str, Any]] = {
+    "png": {"dpi": 150},
+    "pdf": {"metadata": {"CreationDate": None}},
+    "svg": {"metadata": {"Date": None}},
+}
+
+
 def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write PNG (150 dpi) and PDF; without dates, so that equal figures are equal files."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
-    with style():
-        figure.savefig(paths[0], dpi=150)
-        figure.savefig(paths[1], metadata={"CreationDate": None})
+    """Write PNG (150 dpi), PDF and SVG, each whole or not at all."""
+    paths = []
+    # The salt names clip paths: at random without it.
+    with style(), mpl.rc_context({"svg.hashsalt": "slipcar"}):
+        for suffix, options in _SUFFIXES.items():
+            content = io.BytesIO()
+            figure.savefig(content, format=suffix, **options)
+            paths.append(folder / f"{name}.{suffix}")
+            write_atomically(paths[-1], content.getvalue())
     return paths
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from slipcar.evaluation.learning import curves
+from slipcar.evaluation.plot_learning import learning_figure
 from slipcar.evaluation.plot_plan import covariance_figure, iterations_figure
 from slipcar.evaluation.plot_rows import distributions_figure, tradeoff_figure
 from slipcar.evaluation.plot_scene import paths_figure, save_figure, style
+from slipcar.evaluation.report_scene import illustrated
 from slipcar.evaluation.rollout import sample_paths
 
 if TYPE_CHECKING:
@@ -30,15 +33,17 @@ SHOWN_PATHS, MEASURED_PATHS = 100, 4096
 
 
 def save_all(comparison: Comparison, folder: Path) -> list[Path]:
-    """Draw every figure of a comparison; returns the files written (PNG and PDF)."""
+    """Draw every figure of a comparison; returns the files written (PNG, PDF, SVG)."""
     written = []
-    plan = illustrated_plan(comparison)
+    _, plan = illustrated(comparison)
     if plan is not None:
         written += save_plan_figures(comparison.scenario, plan, folder, comparison.seed)
     if comparison.results:
         with style():
             written += save_figure(tradeoff_figure(comparison), folder, "tradeoff")
             written += save_figure(distributions_figure(comparison), folder, "distributions")
+    if curves(comparison.controllers):
+        written += save_figure(learning_figure(comparison), folder, "learning")
     return written
 
 
@@ -56,10 +61,3 @@ def played(plan: Any) -> Any:
     from slipcar.planner import Feedback, OpenLoop
 
     return OpenLoop(plan) if plan.gains is None else Feedback(plan)
-
-
-def illustrated_plan(comparison: Comparison) -> Any | None:
-    """The plan that Figure 1 shows: the reference row's, else the first row's that has one."""
-    names = [comparison.reference, *comparison.controllers]
-    plans = (getattr(comparison.controllers[name], "plan", None) for name in names)
-    return next((plan for plan in plans if plan is not None), None)

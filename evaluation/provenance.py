@@ -88,7 +88,7 @@ PARTS = {
     "policy": ("baselines/policy.py",),
     "core": tuple(
         f"evaluation/{name}.py"
-        for name in ("between", "cells", "controller", "metrics", "noise", "rollout")
+        for name in ("between", "cells", "controller", "makers", "metrics", "noise", "rollout")
     ),
 }
 

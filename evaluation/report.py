@@ -1,19 +1,28 @@
-"""A comparison as tables (terminal, Markdown, LaTeX, CSV), as JSON, and as a folder of all."""
+"""A comparison as a document (tables, figures, raw numbers), as JSON, and as a folder of all."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import json
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from slipcar.baselines.files import write_atomically
-from slipcar.evaluation.store import controller_fingerprint
+from slipcar.evaluation import learning
+from slipcar.evaluation.cells import controller_fingerprint
+from slipcar.evaluation.document import (
+    NONE,
+    Column,
+    Document,
+    Figure,
+    Table,
+    plain,
+    table_of,
+    write_texts,
+)
+from slipcar.evaluation.runs import Runs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,42 +30,17 @@ if TYPE_CHECKING:
 
     from slipcar.evaluation.compare import Comparison
 
-_NONE = "–"
-
-
-@dataclasses.dataclass(frozen=True)
-class Column:
-    """A column of a printed table.
-
-    Attributes:
-        header: with its unit.
-        text: from a row of `Comparison.frame` to what is printed.
-        best: the key whose smallest (`sign` 1) or largest (−1) value is emphasised, or None.
-        sign: see `best`.
-        marked: the key that says of each row whether it is emphasised, or None.
-    """
-
-    header: str
-    text: Callable[[Any], str]
-    best: str | None = None
-    sign: int = 1
-    marked: str | None = None
-
-
-#: Captions and columns of tables, in order.
-Captioned = Sequence[tuple[str, tuple[Column, ...]]]
-
 
 def with_error(key: str) -> Callable[[Any], str]:
     """Text of a mean and its standard error."""
     return lambda row: f"{row[key]:.3f} ± {row[f'{key}_se']:.3f}"
 
 
-def collisions(digits: int) -> Callable[[Any], str]:
-    """Text of the collision rate and its interval, in percent."""
+def collisions(digits: int, key: str = "collision") -> Callable[[Any], str]:
+    """Text of a rate of collisions and its interval, in percent."""
 
     def text(row: Any) -> str:
-        rate, low, high = (100 * row[f"collision_{part}"] for part in ("rate", "low", "high"))
+        rate, low, high = (100 * row[f"{key}_{part}"] for part in ("rate", "low", "high"))
         return f"{rate:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
     return text
@@ -70,16 +54,22 @@ def _difference(key: str, scale: float, digits: int) -> Callable[[Any], str]:
     return text
 
 
-def _number(key: str, digits: int) -> Callable[[Any], str]:
-    return lambda row: f"{round(row[key], digits) + 0.0:.{digits}f}"  # + 0.0: no "-0.000"
+def number(key: str, digits: int, scale: float = 1.0) -> Callable[[Any], str]:
+    """Text of a number."""
+    # + 0.0: no "-0.000"
+    return lambda row: f"{round(scale * row[key], digits) + 0.0:.{digits}f}"
 
 
-def _duration(key: str) -> Callable[[Any], str]:
+def duration(key: str) -> Callable[[Any], str]:
+    """Text of seconds, in the unit that suits them."""
+
     def text(row: Any) -> str:
         seconds = row[key]
         for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
             if seconds >= size:
                 return f"{seconds / size:.3g} {unit}"
+        if seconds != seconds:
+            return NONE
         return f"{seconds / 1e-9:.3g} ns" if seconds > 0.0 else "0 s"
 
     return text
@@ -89,186 +79,226 @@ LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
 TOTAL = Column("total cost", with_error("total"), "total")
 COLLISIONS = Column("collisions [%]", collisions(2), "collision_rate")
 _PARTS = ("effort", "obstacle", "goal")
-COST = (LOOP, TOTAL, *(Column(part, with_error(part)) for part in _PARTS), COLLISIONS)
+COST = (LOOP, TOTAL, *(Column(part, with_error(part), value=part) for part in _PARTS), COLLISIONS)
 #: The same for a terminal, where columns are dear.
-COST_BRIEF = (LOOP, TOTAL, *(Column(part, _number(part, 3)) for part in _PARTS), COLLISIONS)
+COST_BRIEF = (
+    *(LOOP, TOTAL),
+    *(Column(part, number(part, 3), value=part) for part in _PARTS),
+    COLLISIONS,
+)
+BETWEEN = (
+    LOOP,
+    Column("at nodes [%]", collisions(2), "collision_rate"),
+    Column("at or between nodes [%]", collisions(2, "between"), "between_rate"),
+)
 DIFFERENCE = (
     LOOP,
-    Column("Δ total cost", _difference("total_difference", 1.0, 3)),
-    Column("Δ collisions [% points]", _difference("collision_difference", 100.0, 2)),
+    Column("Δ total cost", _difference("total_difference", 1.0, 3), value="total_difference"),
+    Column(
+        "Δ collisions [% points]",
+        _difference("collision_difference", 100.0, 2),
+        value="collision_difference",
+    ),
+    Column(
+        "at or between nodes",
+        _difference("between_difference", 100.0, 2),
+        value="between_difference",
+    ),
+)
+TAILS = (
+    LOOP,
+    *(
+        Column(f"cost {quantile} %", number(f"total_p{quantile}", 3), f"total_p{quantile}")
+        for quantile in (50, 95, 99)
+    ),
+    Column("dearest 5 %", with_error("total_cvar95"), "total_cvar95"),
+    *(
+        Column(f"clearance {int(quantile)} % [m]", number(key, 3), key, -1)
+        for quantile in ("50", "05", "01")
+        for key in (f"clearance_p{quantile}",)
+    ),
+    Column("closest 5 % [m]", number("clearance_cvar05", 3), "clearance_cvar05", -1),
 )
 ACCURACY = (
     LOOP,
-    Column("position RMS [m]", _number("position_rms", 4), "position_rms"),
-    Column("heading RMS [rad]", _number("heading_rms", 4), "heading_rms"),
-    Column("speed RMS [m/s]", _number("speed_rms", 4), "speed_rms"),
-    Column("clearance 1 % [m]", _number("clearance_p01", 3), "clearance_p01", -1),
-    Column("5 % [m]", _number("clearance_p05", 3), "clearance_p05", -1),
-    Column("50 % [m]", _number("clearance_p50", 3), "clearance_p50", -1),
+    Column("position RMS [m]", number("position_rms", 4), "position_rms"),
+    Column("heading RMS [rad]", number("heading_rms", 4), "heading_rms"),
+    Column("speed RMS [m/s]", number("speed_rms", 4), "speed_rms"),
 )
 WORK = (
     LOOP,
-    Column("solver failures", lambda row: f"{int(row['failures'])}"),
-    Column("inference per step", _duration("inference_time")),
-    Column("planning or training", _duration("preparation_time")),
+    Column("solver failures", lambda row: f"{int(row['failures'])}", value="failures"),
+    Column("inference per step", duration("inference_time"), value="inference_time"),
+    Column("planning or training", duration("preparation_time"), value="preparation_time"),
 )
+TRAINING = (
+    Column("training", lambda row: str(row["training"])),
+    Column("total cost", lambda row: str(row["total_text"]), value="total"),
+    Column("spread of cost", number("total_spread", 3), value="total_spread"),
+    Column("collisions [%]", lambda row: str(row["collision_text"]), value="collision_rate"),
+    Column("spread [% points]", number("collision_spread", 2, 100.0), value="collision_spread"),
+)
+#: Captions of the figures that `plots.save_all` draws, in the order in which they are shown.
+FIGURES = {
+    "tradeoff": "What a path costs on average, against how often it collides, with 95 % intervals.",
+    "learning": "Validation cost of the trainings, best so far, against samples and time: median "
+    "and range over seeds; plans are level lines.",
+    "distributions": "How the cost of a path is distributed, and its dear tail.",
+    "iterations": "Every accepted iterate of the reference plan, and sample paths of the last.",
+    "covariance": "The plan's predicted covariance against Monte Carlo.",
+}
 
 
-def tables(comparison: Comparison, brief: bool = False) -> list[tuple[str, tuple[Column, ...]]]:
-    """Captions and columns of the printed tables, in order."""
-    return [
+def tables(comparison: Comparison, brief: bool = False) -> tuple[Table, ...]:
+    """The printed tables, in order."""
+    captioned: list[tuple[str, tuple[Column, ...]]] = [
         (
             "Cost of a path (mean ± standard error) and collisions (Wilson 95 % interval)",
             COST_BRIEF if brief else COST,
         ),
         (
+            "Collisions: at a node, and at or between nodes (Brownian bridges between them); "
+            "Wilson 95 % intervals",
+            BETWEEN,
+        ),
+        (
             f"Paired difference to “{comparison.reference}” on the same Brownian paths "
-            "(bootstrap 95 % interval)",
+            "(BCa bootstrap 95 % interval)",
             DIFFERENCE,
         ),
-        ("Error at the goal, and clearance: quantiles of the smallest distance to a rim", ACCURACY),
-        ("Solver failures and time (inference: 1024 episodes at once, time for one)", WORK),
+        (
+            "Tails: quantiles of the cost, and the mean of the dearest 5 % (CVaR ± standard "
+            "error); quantiles of the smallest distance to a rim, and the mean of the closest 5 %",
+            TAILS,
+        ),
+        ("Error at the goal", ACCURACY),
     ]
+    frame = comparison.frame
+    done = [table_of(frame, caption, columns) for caption, columns in captioned]
+    trainings = training_frame(frame, comparison)
+    if len(trainings):
+        caption = (
+            "Training noise: learners trained from several seeds (mean, its error from trainings "
+            "and paths together, and the standard deviation between trainings), then each "
+            "training. In all tables their intervals are Student's t over trainings and paths"
+        )
+        done.append(table_of(trainings, caption, TRAINING))
+    learned = learning.table(comparison)
+    if learned is not None:
+        done.append(learned)
+    caption = "Solver failures and time (inference: 1024 episodes at once, time for one)"
+    return (*done, table_of(frame, caption, WORK))
 
 
-def cells(
-    frame: pd.DataFrame, columns: tuple[Column, ...], emphasise: Callable[[str], str]
-) -> list[list[str]]:
-    """Text of every cell, the name first; the best of a column, or those marked, are emphasised.
+def training_frame(frame: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
+    """Rows of which several trainings were driven, each followed by its trainings."""
+    import pandas as pd
 
-    Rows that print the same as the best are emphasised with it.
+    found: list[tuple[str, str, Mapping[Any, Any]]] = []
+    for name, result in comparison.results.items():
+        if len(result.runs) < 2:
+            continue
+        controller = comparison.controllers[name]
+        labels = controller.labels if isinstance(controller, Runs) else ()
+        found.append((name, f"all {len(result.runs)}", frame.loc[name].to_dict()))
+        each = zip(labels, result.runs, strict=True)
+        found += [(name, label, run.summary()) for label, run in each]
+    keys = ("total", "total_se", "total_spread", "collision_rate", "collision_spread")
+    rows = [
+        {
+            "training": training,
+            **{key: row.get(key, float("nan")) for key in keys},
+            "total_text": with_error("total")(row),
+            "collision_text": collisions(2)(row),
+        }
+        for _, training, row in found
+    ]
+    index = pd.Index([name for name, _, _ in found], name="controller")
+    return pd.DataFrame(rows, index=index)
+
+
+def frames(frame: pd.DataFrame, comparison: Comparison) -> dict[str, pd.DataFrame]:
+    """Raw numbers by file: `table`, which is the same wherever it is computed, and `times`."""
+    import pandas as pd
+
+    timed = [name for name in frame if str(name).endswith("_time")]
+    wall = {name: result.wall_time for name, result in comparison.results.items()}
+    times = frame[timed].assign(wall_time=pd.Series(wall, dtype=float))
+    named = {"table": frame.drop(columns=timed), "times": times}
+    trainings = training_frame(frame, comparison)
+    if len(trainings):
+        named["trainings"] = trainings.drop(columns=["total_text", "collision_text"])
+    learned = learning.frame(comparison)
+    if len(learned):
+        named["learning"] = learned.drop(columns=["planning_time"])  # differs from run to run
+    return named
+
+
+def setting(comparison: Comparison, fewer: bool = True) -> str:
+    """A sentence on what was run.
+
+    Args:
+        comparison: it.
+        fewer: whether to tell of rows that drove fewer episodes than others.
     """
-    rows = [row for _, row in frame.iterrows()]
-    printed = [[str(name) for name in frame.index]]
-    for column in columns:
-        texts = [_NONE if row["error"] else column.text(row) for row in rows]
-        texts = [_NONE if "nan" in text else text for text in texts]
-        if column.best is not None and sum(text != _NONE for text in texts) > 1:
-            best = texts[int(np.nanargmin(column.sign * frame[column.best].astype(float)))]
-            texts = [emphasise(text) if text == best else text for text in texts]
-        if column.marked is not None:
-            chosen = frame[column.marked].eq(True)
-            texts = [
-                emphasise(text) if mark else text for text, mark in zip(texts, chosen, strict=True)
-            ]
-        printed.append(texts)
-    return [list(row) for row in zip(*printed, strict=True)]
-
-
-def setting(comparison: Comparison) -> str:
-    """A sentence on what was run."""
     scenario = comparison.scenario
+    counts = [result.episodes for result in comparison.results.values()] if fewer else []
+    least = min(counts, default=comparison.episodes)
+    episodes = f"{least:,} to " if least < comparison.episodes else ""
+    steps = f" ({comparison.substeps} Euler–Maruyama steps each)" if comparison.substeps > 1 else ""
     return (
-        f"{comparison.episodes:,} episodes a row, seed {comparison.seed}, every row over the "
-        f"same Brownian paths; {scenario.nodes - 1} control steps of {scenario.dt:g} s, "
-        f"{len(scenario.obstacles)} obstacles."
+        f"{episodes}{comparison.episodes:,} episodes a row, seed {comparison.seed}, every row over "
+        f"the same Brownian paths; {scenario.nodes - 1} control steps of {scenario.dt:g} s"
+        f"{steps}, {len(scenario.obstacles)} obstacles."
     )
 
 
-def machine(comparison: Comparison) -> str:
-    """A sentence on where it was run."""
-    told = comparison.provenance
-    versions = ", ".join(f"{name} {version}" for name, version in told["versions"].items())
-    commit = f", commit {told['commit'][:12]}" if told["commit"] else ""
-    return f"{told['cpu']}, Python {told['python']}, {versions}{commit}, {told['date']}."
+def messages(comparison: Comparison) -> tuple[str, ...]:
+    """What a reader must be told: the comparison's notes, and rows that failed."""
+    errors = comparison.errors.items()
+    return (*comparison.warnings, *(f"{name} did not finish: {text}" for name, text in errors))
+
+
+def document(
+    comparison: Comparison,
+    *,
+    title: str = "Comparison",
+    notes: tuple[str, ...] = (),
+    brief: bool = False,
+) -> Document:
+    """What a comparison has to show; figures and scene are added by :func:`save`.
+
+    Args:
+        comparison: what was run.
+        title: of its section in a report.
+        notes: what a reader must be told besides what the comparison says itself.
+        brief: with fewer columns, for a terminal.
+    """
+    return Document(
+        kind="compare",
+        title=title,
+        setting=setting(comparison),
+        tables=tables(comparison, brief),
+        notes=(*notes, *messages(comparison)),
+        figures=(),
+        frames=frames(comparison.frame, comparison),
+        provenance=comparison.provenance,
+    )
 
 
 def markdown(comparison: Comparison) -> str:
-    """Tables in Markdown with their captions, errors and provenance."""
-    parts = [setting(comparison), *markdown_tables(comparison.frame, tables(comparison))]
-    parts += [f"`{name}` did not finish: {text}" for name, text in comparison.errors.items()]
-    parts.append(f"Computed on {machine(comparison)}")
-    return "\n\n".join(parts) + "\n"
-
-
-def markdown_tables(frame: pd.DataFrame, captioned: Captioned) -> list[str]:
-    """Captions and tables in Markdown, in turn."""
-    from tabulate import tabulate
-
-    parts = []
-    for caption, columns in captioned:
-        rows = cells(frame, columns, lambda text: f"**{text}**")
-        headers = ["controller", *(column.header for column in columns)]
-        parts.append(f"**{caption}**")
-        parts.append(tabulate(rows, headers, tablefmt="github", disable_numparse=True))
-    return parts
+    """Tables in Markdown with their captions, notes and provenance."""
+    return document(comparison).markdown()
 
 
 def latex(comparison: Comparison) -> str:
     r"""Tables in LaTeX; they need `\usepackage{booktabs}`."""
-    parts = [f"% {setting(comparison)}", f"% {machine(comparison)}"]
-    return "\n".join([*parts, *latex_tables(comparison.frame, tables(comparison))])
-
-
-def latex_tables(frame: pd.DataFrame, captioned: Captioned) -> list[str]:
-    """Floating tables in LaTeX."""
-    import pandas as pd
-
-    parts = []
-    for caption, columns in captioned:
-        rows = cells(frame, columns, lambda text: f"\x02{text}\x03")
-        headers = ["controller", *(column.header for column in columns)]
-        escaped = pd.DataFrame([[_tex(text) for text in row] for row in rows])
-        escaped.columns = pd.Index([_tex(text) for text in headers])
-        parts.append(
-            escaped.to_latex(
-                index=False,
-                escape=False,
-                caption=_tex(caption) + ".",
-                column_format="l" * 2 + "r" * (len(columns) - 1),
-                position="htb",
-            )
-        )
-    return parts
-
-
-_TEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$",
-    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "±": r"$\pm$", "Δ": r"$\Delta$", "µ": r"\textmu{}",
-    "≤": r"$\leq$", "ν": r"$\nu$", "“": "``", "”": "''", "–": "--",
-    "\x02": r"\textbf{", "\x03": "}",
-}  # fmt: skip
-
-
-def _tex(text: str) -> str:
-    return "".join(_TEX.get(letter, letter) for letter in text)
+    return document(comparison).latex()
 
 
 def terminal(comparison: Comparison) -> Group:
     """Tables for a terminal, to be printed by a rich console."""
-    from rich.console import Group
-    from rich.text import Text
-
-    parts: list[Any] = [Text(setting(comparison)), Text()]
-    parts += terminal_tables(comparison.frame, tables(comparison, brief=True))
-    for name, message in comparison.errors.items():
-        parts.append(Text(f"{name} did not finish: {message}", style="bold red"))
-    return Group(*parts)
-
-
-def terminal_tables(frame: pd.DataFrame, captioned: Captioned) -> list[Any]:
-    """Captions and tables of rich, in turn."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    parts: list[Any] = []
-    for caption, columns in captioned:
-        parts.append(Text(caption, style="bold"))
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="")
-        table.add_column(Text("controller"), no_wrap=True)
-        for i, column in enumerate(columns):
-            table.add_column(Text(column.header), justify="left" if i == 0 else "right")
-        for row in cells(frame, columns, lambda text: f"\x02{text}"):
-            table.add_row(
-                *(
-                    Text(text[1:], style="bold green") if text[:1] == "\x02" else Text(text)
-                    for text in row
-                )
-            )
-        parts.append(table)
-    return parts
+    return document(comparison, brief=True).terminal()
 
 
 def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
@@ -292,7 +322,7 @@ def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
             {
                 "controller": name,
                 "fingerprint": controller_fingerprint(comparison.controllers[str(name)]),
-                **{key: _plain(value) for key, value in row.items()},
+                **{key: plain(value) for key, value in row.items()},
             }
             for name, row in frame.iterrows()
         ],
@@ -300,41 +330,65 @@ def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
-def _plain(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def save(
+    comparison: Comparison,
+    folder: Path,
+    figures: bool,
+    *,
+    title: str = "Comparison",
+    notes: tuple[str, ...] = (),
+) -> list[Path]:
+    """Write the tables, the JSON, what a report needs, and the figures; see `Comparison.save`."""
+    from slipcar.evaluation.report_scene import scene
 
+    def draw() -> list[Path]:
+        from slipcar.evaluation import plots
 
-def save(comparison: Comparison, folder: Path, figures: bool) -> list[Path]:
-    """Write the tables, the JSON and the figures; see `Comparison.save`."""
-    written = write_texts(
-        folder,
-        {
-            "table.md": comparison.to_markdown(),
-            "table.csv": comparison.frame.to_csv(),
-            "table.tex": comparison.to_latex(),
-            "results.json": comparison.to_json(),
-        },
+        return plots.save_all(comparison, folder)
+
+    shown = document(comparison, title=title, notes=notes)
+    written = write_texts(folder, {"results.json": comparison.to_json()})
+    draw_if_wanted = draw if figures else None
+    return written + save_document(
+        shown, folder, draw_if_wanted, FIGURES, lambda: scene(comparison)
     )
-    if figures:
+
+
+def save_document(
+    shown: Document,
+    folder: Path,
+    draw: Callable[[], list[Path]] | None = None,
+    captions: Mapping[str, str] = MappingProxyType({}),
+    animate: Callable[[], Mapping[str, Any]] | None = None,
+) -> list[Path]:
+    """Write a document, then once more with its animation and with the figures that were drawn.
+
+    What takes long or can fail comes after the tables are there.
+
+    Args:
+        shown: without figures and scene.
+        folder: made if it does not exist.
+        draw: draws into the folder and returns the files; None for no figures.
+        captions: stem -> caption, in the order in which figures are shown.
+        animate: makes the scene; None for no animation.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ImportError: without matplotlib; the tables are there all the same.
+    """
+    written = shown.save(folder)
+    if animate is not None:
+        shown = dataclasses.replace(shown, scene=animate())
+        shown.save(folder)
+    if draw is not None:
         with tables_are_in(folder):
-            from slipcar.evaluation import plots
-        written += plots.save_all(comparison, folder)
-    return written
-
-
-def write_texts(folder: Path, texts: dict[str, str]) -> list[Path]:
-    """Write files, name -> text, into a folder that is made if need be; returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, text in texts.items():
-        path = folder / name
-        write_atomically(path, text.encode())
-        written.append(path)
+            drawn = draw()
+        stems = {path.stem for path in drawn}
+        figures = tuple(Figure(stem, text) for stem, text in captions.items() if stem in stems)
+        dataclasses.replace(shown, figures=figures).save(folder)
+        written += drawn
     return written
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from slipcar import baselines
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.controller import Controller
-from slipcar.evaluation.learned import learned_rows, trainings
+from slipcar.evaluation.learned import learned_rows
 from slipcar.evaluation.makers import chargeable
 from slipcar.evaluation.runs import Runs
 from slipcar.planner import Feedback, OpenLoop, Plan, RecedingHorizon, plan
@@ -102,9 +102,7 @@ def learned(
             "`slipcar train --scenario ...` and pass it with --policy."
         )
         return {}
-    rows: dict[str, Controller | Runs] = {**learned_rows("paper", methods)}
-    notes += trainings(rows)
-    return rows
+    return {**learned_rows("paper", methods)}
 
 
 def plan_notes(name: str, found: Plan) -> list[str]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +22,7 @@ from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.cells import Store
 from slipcar.evaluation.controller import Controller
 from slipcar.evaluation.executors import open_executor
-from slipcar.evaluation.makers import Maker
 from slipcar.evaluation.metrics import Result
-from slipcar.evaluation.own_controllers import load_controller
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts
@@ -36,27 +34,10 @@ if TYPE_CHECKING:
 
     from slipcar.evaluation.document import Document
 
-
-@dataclasses.dataclass(frozen=True)
-class Own:
-    """A user's controller, looked up for each world.
-
-    Attributes:
-        text: what names it, see :mod:`slipcar.evaluation.own_controllers`.
-        trust: whether a model may be loaded by unpickling.
-    """
-
-    text: str
-    trust: bool = False
-
-    def load(self, scenario: Scenario) -> Controller:
-        """The controller for this scenario."""
-        return load_controller(self.text, scenario, trust=self.trust)[1]
-
-
-#: What a row may be: made for each world by a worker, or brought along, once or in several
-#: trainings, or a user's.
-Row = Maker | Controller | Runs | Own
+#: What a row may be: a function of the scenario that makes its controller, called by a worker for
+#: each world (a :class:`slipcar.evaluation.makers.Maker`, or a user's own); or brought along, once
+#: or in several trainings.
+Row = Callable[[Scenario], Controller] | Controller | Runs
 #: Columns that differ from run to run: they go to a file of their own.
 TIMES = ("inference_time", "preparation_time")
 
@@ -214,7 +195,7 @@ def run_suite(
         )
         for row, controller in suite.rows.items()
         for variant in suite.variants
-        for label, one in _trainings(controller, variant.scenario).items()
+        for label, one in _trainings(controller).items()
     ]
     totals: dict[str, int] = {}
     for job in jobs:
@@ -224,7 +205,7 @@ def run_suite(
     results, errors = {}, {}
     for row, controller in suite.rows.items():
         for variant in suite.variants:
-            names = [(row, f"{variant.label}\n{label}") for label in _labels(controller)]
+            names = [(row, f"{variant.label}\n{label}") for label in _trainings(controller)]
             failed = [swept.errors[name] for name in names if name in swept.errors]
             if failed:
                 errors[row, variant.label] = failed[0]
@@ -244,15 +225,11 @@ def run_suite(
     )
 
 
-def _trainings(controller: Row, scenario: Scenario) -> dict[str, Any]:
+def _trainings(controller: Row) -> dict[str, Any]:
     """Label -> controller of everything behind a row."""
     if isinstance(controller, Runs):
         return dict(zip(controller.labels, controller.controllers, strict=True))
-    return {"": controller.load(scenario) if isinstance(controller, Own) else controller}
-
-
-def _labels(controller: Row) -> tuple[str, ...]:
-    return controller.labels if isinstance(controller, Runs) else ("",)
+    return {"": controller}
 
 
 def save_suite(
@@ -266,12 +243,14 @@ def save_suite(
         folder: made if it does not exist.
         figures: also draw the figure (`pip install slipcar[plot]`).
     """
-    written = document.save(folder)
-    if figures and result.results:
-        from slipcar.evaluation.report import tables_are_in
+    from slipcar.evaluation.report import save_document
 
-        with tables_are_in(Path(folder)):
-            from slipcar.evaluation import plot_suites
+    def draw() -> list[Path]:
+        from slipcar.evaluation import plot_suites
+
         figure = plot_suites.FIGURES[result.suite.name](result)
-        written += plot_suites.save_figure(figure, Path(folder), result.suite.name)
-    return written
+        return plot_suites.save_figure(figure, Path(folder), result.suite.name)
+
+    captions = {figure.stem: figure.caption for figure in document.figures}
+    bare = dataclasses.replace(document, figures=())
+    return save_document(bare, Path(folder), draw if figures and result.results else None, captions)

@@ -230,11 +230,12 @@ def test_an_interrupted_compare_says_where_its_rows_are(tmp_path, capsys, monkey
         def predict(self, *arguments, **rest):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("slipcar.baselines.load_policy", lambda path=None: Interrupts())
+    policies = (Interrupts(), Interrupts())
+    monkeypatch.setattr("slipcar.baselines.shipped_runs", lambda method, world: policies)
     arguments = ["compare", "--episodes", "100", "--folder", str(tmp_path)]
     assert main(arguments) == 130
-    assert f"finished rows are kept in {tmp_path}" in capsys.readouterr().err
-    assert len(list((tmp_path / "rows").glob("*.npz"))) == 4
+    assert f"finished work is kept in {tmp_path}" in capsys.readouterr().err
+    assert len(list((tmp_path / "cells").glob("*.npz"))) == 4
 
 
 def test_scenarios_by_name_seed_and_file(tmp_path):

@@ -7,7 +7,7 @@ from slipcar.envs import Scenario
 from slipcar.evaluation import compare, evaluate
 from slipcar.evaluation.metrics import FIELDS
 from slipcar.evaluation.provenance import commit, provenance
-from slipcar.evaluation.statistics import half_width, paired_difference
+from slipcar.evaluation.statistics import paired_difference
 
 EPISODES = 300
 
@@ -178,7 +178,7 @@ def test_latex_is_escaped_and_ruled(rows, paper):
     assert r"100 \% SCP\_1 \& co" in text
     for part in (r"\toprule", r"\midrule", r"\bottomrule", r"\textbf{", r"$\pm$", r"$\Delta$"):
         assert part in text
-    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 4
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 6
 
 
 def test_csv_holds_the_raw_numbers(rows, paper, tmp_path):
@@ -214,9 +214,9 @@ def test_provenance_is_about_this_checkout():
 def test_save_writes_the_tables(rows, paper, tmp_path):
     c = run(rows, paper)
     written = c.save(tmp_path / "deep" / "folder", figures=False)
-    assert [path.name for path in written] == [
-        "table.md", "table.csv", "table.tex", "results.json"
-    ]  # fmt: skip
+    assert {path.name for path in written} == {
+        "table.md", "table.csv", "times.csv", "table.tex", "results.json", "document.json"
+    }  # fmt: skip
     assert (tmp_path / "deep/folder/table.md").read_text(encoding="utf-8") == c.to_markdown()
 
 

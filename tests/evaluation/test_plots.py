@@ -8,6 +8,8 @@ from matplotlib.patches import Circle, Ellipse
 
 from slipcar.envs import Scenario
 from slipcar.evaluation import compare, plots, sample_paths
+from slipcar.evaluation.document import read_document
+from slipcar.evaluation.plot_rows import drawn_ranks
 from slipcar.planner import OpenLoop, plan
 
 
@@ -92,15 +94,40 @@ def test_rows_figures(paper, replay, turning):
     assert right.lines[0].get_ydata()[0] == pytest.approx(1.0)
 
 
+def test_no_two_rows_look_the_same(paper, replay):
+    rows = {f"row {i}": replay(paper, (0.0, 0.0)) for i in range(14)}
+    for i in range(0, 14, 3):
+        rows[f"row {i}"].closed_loop = True
+    c = compare(rows, paper, 20, progress=False)
+    left, _ = plots.distributions_figure(c).axes
+    looks = {(line.get_color(), str(line._unscaled_dash_pattern)) for line in left.lines}
+    assert len(looks) == len(left.lines) == 14
+
+
+@pytest.mark.parametrize("count", [1, 2, 4000, 4001, 100_000, 10_000_000])
+def test_distributions_are_drawn_through_enough_points(count):
+    ranks = drawn_ranks(count)
+    assert (ranks[0], ranks[-1]) == (0, count - 1)
+    assert len(ranks) <= 4200
+    steps = np.diff(ranks)
+    assert (steps >= 1).all()
+    assert (steps <= 1 + count / 1999).all()  # of the share: less than a line is wide
+    left = count - ranks  # how many cost at least so much
+    assert (left[:-1] <= 1.01 * left[1:] + 1).all()  # of its logarithm likewise
+    assert (np.diff(ranks[-100:]) == 1).all()
+
+
 def test_everything_is_written(planned, tmp_path):
     scenario, found, _ = planned
     c = compare({"SCP": OpenLoop(found)}, scenario, 500, progress=False)
     written = c.save(tmp_path)
     names = {path.name for path in written}
-    for figure in ("iterations", "covariance", "tradeoff", "distributions"):
-        assert {f"{figure}.png", f"{figure}.pdf"} <= names
+    figures = ("tradeoff", "distributions", "iterations", "covariance")
+    for figure in figures:
+        assert {f"{figure}.png", f"{figure}.pdf", f"{figure}.svg"} <= names
+    assert tuple(figure.stem for figure in read_document(tmp_path).figures) == figures
     for path in written:
-        assert path.stat().st_size > 500
+        assert path.stat().st_size > 50
     assert (tmp_path / "tradeoff.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (tmp_path / "tradeoff.pdf").read_bytes()[:4] == b"%PDF"
 
