@@ -151,7 +151,7 @@ def draw(curves: Sequence[Curve], folder: Path) -> list[Path]:
     """Log-log plot with the fitted lines: growth.png and growth.pdf."""
     from matplotlib.ticker import LogLocator
 
-    from slipcar.evaluation.plot_scene import PALETTE, new_figure, save_figure, style
+    from slipcar.evaluation.figures.scene import PALETTE, new_figure, save_figure, style
 
     with style():
         figure = new_figure(5.6, 4.2)

@@ -23,7 +23,7 @@ def draw(
         promised: δ of those that promise one.
         folder: where the figure goes.
     """
-    from slipcar.evaluation.plot_scene import GREY, PALETTE, new_figure, save_figure, style
+    from slipcar.evaluation.figures.scene import GREY, PALETTE, new_figure, save_figure, style
 
     with style():
         figure = new_figure(5.6, 4.0)

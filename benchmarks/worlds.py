@@ -207,7 +207,7 @@ def raw(found: Found) -> dict[str, Any]:
 
 def draw(found: Found, folder: Path) -> list[Path]:
     """Sorted cost ratios: worlds.png and worlds.pdf."""
-    from slipcar.evaluation.plot_scene import GREY, PALETTE, new_figure, save_figure, style
+    from slipcar.evaluation.figures.scene import GREY, PALETTE, new_figure, save_figure, style
 
     pairs = [(SAME, IPOPT), (DIRECT, IPOPT), (SEVERAL, IPOPT_BEST)]
     with style():

@@ -10,17 +10,17 @@ import importlib
 import sys
 from collections.abc import Callable, Sequence
 
-#: name -> (module, function, what `slipcar --help` says). Imported when asked for, because
-#: help should not take a second.
+#: Command -> what `slipcar --help` says of it. A command is a function in a module of its name;
+#: it is imported when asked for, because help should not take a second.
 COMMANDS = {
-    "compare": ("cli_compare", "compare", "tables and figures: planners and policies, in suites"),
-    "dataset": ("cli_dataset", "dataset", "write episodes of any controller as a Minari dataset"),
-    "frontier": ("cli_frontier", "frontier", "what safety costs: effort against collision rate"),
-    "plan": ("cli_plan", "plan", "plan one scenario: iterations, certificate, figures"),
-    "report": ("cli_report", "report", "one page of all results: tables, figures, animations"),
-    "reproduce": ("cli_reproduce", "reproduce", "the paper's claims, one by one, by numbers"),
-    "simulate": ("cli_simulate", "simulate", "drive a few episodes; show, draw or film them"),
-    "train": ("cli_train", "train", "train a policy: PPO and others, on a scenario or a family"),
+    "compare": "tables and figures: planners and policies, in suites of worlds",
+    "dataset": "write episodes of any controller as a Minari dataset",
+    "frontier": "what safety costs: effort against collision rate",
+    "plan": "plan one scenario: iterations, certificate, figures",
+    "report": "one page of all results: tables, figures, animations",
+    "reproduce": "the paper's claims, one by one, by numbers",
+    "simulate": "drive a few episodes; show, draw or film them",
+    "train": "train a policy: PPO and others, on a scenario or a family",
 }
 _DESCRIPTION = """Stochastic SCP, a slipping car, and an honest comparison with PPO.
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             prog = f"slipcar {arguments[0]}"
             return int(tyro.cli(command, prog=prog, args=arguments[1:]) or 0)
         # Help, or nothing that is a command: tyro says which there are.
-        summaries = {name: _summary(text) for name, (_, _, text) in COMMANDS.items()}
+        summaries = {name: _summary(text) for name, text in COMMANDS.items()}
         tyro.extras.subcommand_cli_from_dict(
             summaries, prog="slipcar", description=_DESCRIPTION, args=arguments
         )
@@ -67,8 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _command(name: str) -> Callable[..., int]:
-    module, function, _ = COMMANDS[name]
-    return getattr(importlib.import_module(f"slipcar.evaluation.{module}"), function)
+    return getattr(importlib.import_module(f"slipcar.evaluation.commands.{name}"), name)
 
 
 def _summary(text: str) -> Callable[[], None]:

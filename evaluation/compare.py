@@ -22,7 +22,7 @@ from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts, evaluate
 from slipcar.evaluation.runs import Runs
 from slipcar.evaluation.statistics import episodes_for, half_width
-from slipcar.evaluation.suites import Row
+from slipcar.evaluation.suites.suite import Row
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, message, sweep
 
 if TYPE_CHECKING:
@@ -292,13 +292,13 @@ class Comparison:
 
     def to_markdown(self) -> str:
         """Tables in Markdown with what they mean and where they come from."""
-        from slipcar.evaluation import report
+        from slipcar.evaluation.report import comparison as report
 
         return report.markdown(self)
 
     def to_latex(self) -> str:
         """The same as LaTeX (booktabs)."""
-        from slipcar.evaluation import report
+        from slipcar.evaluation.report import comparison as report
 
         return report.latex(self)
 
@@ -308,7 +308,7 @@ class Comparison:
 
     def to_json(self) -> str:
         """Raw numbers, scenario, seed, options, versions and machine."""
-        from slipcar.evaluation import report
+        from slipcar.evaluation.report import comparison as report
 
         return report.json_text(self)
 
@@ -322,7 +322,7 @@ class Comparison:
         Returns:
             The files written.
         """
-        from slipcar.evaluation import report
+        from slipcar.evaluation.report import comparison as report
 
         return report.save(self, Path(folder), figures)
 

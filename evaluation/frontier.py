@@ -275,7 +275,7 @@ class Frontier:
 
     def to_markdown(self) -> str:
         """The tables in Markdown with what they mean and where they come from."""
-        from slipcar.evaluation import report_frontier
+        from slipcar.evaluation.report import frontier as report_frontier
 
         return report_frontier.markdown(self)
 
@@ -289,6 +289,6 @@ class Frontier:
         Returns:
             The files written.
         """
-        from slipcar.evaluation import report_frontier
+        from slipcar.evaluation.report import frontier as report_frontier
 
         return report_frontier.save(self, Path(folder), figures)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slipcar.evaluation.document import Column, Table, table_of
+from slipcar.evaluation.report.document import Column, Table, table_of
 from slipcar.evaluation.rows import FEEDBACK, STEERED, STOCHASTIC
 from slipcar.evaluation.runs import Runs
 

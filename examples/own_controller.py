@@ -59,7 +59,7 @@ def controller(t, x):
 
 if __name__ == "__main__":
     from slipcar.evaluation import compare
-    from slipcar.evaluation.as_controller import as_controller
+    from slipcar.evaluation.own import as_controller
     from slipcar.planner import Feedback, plan
 
     rows = {

@@ -7,7 +7,7 @@ import pytest
 
 from slipcar.envs import Family, Scenario
 from slipcar.evaluation.cli import COMMANDS, main
-from slipcar.evaluation.cli_inputs import read_controller, read_scenario
+from slipcar.evaluation.commands.inputs import read_controller, read_scenario
 from slipcar.evaluation.makers import chargeable
 from slipcar.planner import Feedback, OpenLoop, Plan, Status, plan
 

@@ -223,7 +223,7 @@ def test_save_writes_the_tables(rows, paper, tmp_path):
 def test_the_terminal_shows_every_row_and_interval(rows, paper):
     from rich.console import Console
 
-    from slipcar.evaluation.report import terminal
+    from slipcar.evaluation.report.comparison import terminal
 
     c = run({**rows, "broken": Raises(RuntimeError("no [fuel]"))}, paper)
     console = Console(width=140, record=True, file=open("/dev/null", "w"))  # noqa: SIM115

@@ -14,7 +14,7 @@ from slipcar.baselines import load_policy, straight
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
 from slipcar.evaluation.cli import main
-from slipcar.evaluation.cli_inputs import read_controller
+from slipcar.evaluation.commands.inputs import read_controller
 from slipcar.evaluation.episodes import record
 from slipcar.evaluation.noise import block_noise, block_starts
 from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan

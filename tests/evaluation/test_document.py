@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipcar.evaluation.document import (
+from slipcar.evaluation.report.document import (
     Column,
     Document,
     Figure,
@@ -251,7 +251,7 @@ def test_latex_takes_text_as_text(document, name, expected):
 
 
 def test_every_greek_letter_is_a_command():
-    from slipcar.evaluation.report_text import tex
+    from slipcar.evaluation.report.text import tex
 
     text = tex("αβγδεζηθικλμνξπρστυφχψωΓΔΘΛΞΠΣΦΨΩ⁰¹²³⁴⁵⁶⁷⁸⁹₀₁₂₃₄₅₆₇₈₉")
     assert text.isascii()
@@ -260,7 +260,7 @@ def test_every_greek_letter_is_a_command():
 
 
 def test_a_printed_table_as_csv_reads_back(document):
-    from slipcar.evaluation.report_text import csv_table
+    from slipcar.evaluation.report.text import csv_table
 
     table = named('a, "b"\nc')
     assert list(csv.reader(csv_table(table).splitlines(keepends=True))) == [

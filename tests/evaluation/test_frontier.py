@@ -7,7 +7,6 @@ import pytest
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
 from slipcar.evaluation.cli import main
-from slipcar.evaluation.document import read_document
 from slipcar.evaluation.frontier import (
     FEEDBACK,
     OPEN_LOOP,
@@ -19,6 +18,7 @@ from slipcar.evaluation.frontier import (
     point_name,
     undominated,
 )
+from slipcar.evaluation.report.document import read_document
 from slipcar.evaluation.statistics import wilson_interval
 from slipcar.planner import Feedback, OpenLoop, Status, plan
 
@@ -207,7 +207,7 @@ def markers(figure):
 
 def test_the_figure_shows_every_point_where_it_is(traced):
     pytest.importorskip("matplotlib")
-    from slipcar.evaluation.plot_frontier import frontier_figure
+    from slipcar.evaluation.figures.frontier import frontier_figure
 
     figure = frontier_figure(traced)
     drawn = [(x, y) for _, x, y in markers(figure)]
@@ -225,8 +225,8 @@ def test_the_figure_shows_every_point_where_it_is(traced):
 
 def test_labels_cover_neither_markers_nor_each_other():
     pytest.importorskip("matplotlib")
-    from slipcar.evaluation.plot_labels import Label, place
-    from slipcar.evaluation.plot_scene import new_figure
+    from slipcar.evaluation.figures.labels import Label, place
+    from slipcar.evaluation.figures.scene import new_figure
 
     figure = new_figure(5.0, 4.0)
     axes = figure.subplots()
@@ -243,7 +243,7 @@ def test_labels_cover_neither_markers_nor_each_other():
 
 def test_an_axis_is_broken_between_groups_alone():
     pytest.importorskip("matplotlib")
-    from slipcar.evaluation.plot_frontier import widest_gap
+    from slipcar.evaluation.figures.frontier import widest_gap
 
     assert widest_gap([[5.0, 5.3], [4.9], [7.0, 9.0]]) == (5.3, 7.0)
     assert widest_gap([[5.0, 9.0], [4.9]]) is None  # the wide gap is within a curve

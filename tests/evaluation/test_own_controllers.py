@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from slipcar.evaluation import compare, evaluate, sample_paths
-from slipcar.evaluation.adapters import ActionFunction, StateFunction, per_row
-from slipcar.evaluation.as_controller import as_controller
-from slipcar.evaluation.own_controllers import (
+from slipcar.evaluation.own.adapters import ActionFunction, StateFunction, per_row
+from slipcar.evaluation.own.as_controller import as_controller
+from slipcar.evaluation.own.load import (
     entry_points,
     load_controller,
     load_maker,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from slipcar.evaluation import evaluate
-from slipcar.evaluation.as_controller import as_controller
-from slipcar.evaluation.own_controllers import load_controller
-from slipcar.evaluation.sb3_models import algorithm_of
+from slipcar.evaluation.own.as_controller import as_controller
+from slipcar.evaluation.own.load import load_controller
+from slipcar.evaluation.own.sb3_models import algorithm_of
 
 torch = pytest.importorskip("torch")
 

@@ -7,9 +7,10 @@ pytest.importorskip("matplotlib")
 from matplotlib.patches import Circle, Ellipse
 
 from slipcar.envs import Scenario
-from slipcar.evaluation import compare, plots, sample_paths
-from slipcar.evaluation.document import read_document
-from slipcar.evaluation.plot_rows import drawn_ranks
+from slipcar.evaluation import compare, sample_paths
+from slipcar.evaluation.figures import saved as plots
+from slipcar.evaluation.figures.rows import drawn_ranks
+from slipcar.evaluation.report.document import read_document
 from slipcar.planner import OpenLoop, plan
 
 
@@ -56,8 +57,8 @@ def test_ellipses_hold_95_percent_of_the_paths(planned):
 
 
 def test_an_ellipse_is_that_of_its_covariance():
-    from slipcar.evaluation.plot_plan import _draw_ellipse
-    from slipcar.evaluation.plot_scene import new_figure
+    from slipcar.evaluation.figures.plan import _draw_ellipse
+    from slipcar.evaluation.figures.scene import new_figure
 
     S = np.array([[4.0, 1.5], [1.5, 1.0]])
     axes = new_figure(3, 3).subplots()

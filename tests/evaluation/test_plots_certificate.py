@@ -4,8 +4,8 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from slipcar.envs import Scenario
-from slipcar.evaluation.plots_certificate import plot_hamiltonian
-from slipcar.evaluation.plots_residuals import plot_residuals
+from slipcar.evaluation.figures.certificate import plot_hamiltonian
+from slipcar.evaluation.figures.residuals import plot_residuals
 from slipcar.evaluation.residuals import Curve
 from slipcar.planner import plan
 from slipcar.planner.certificate import certify

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from slipcar.evaluation import compare, sample_paths
-from slipcar.evaluation.document import Figure, read_document
-from slipcar.evaluation.report import TAILS, document, duration, save, save_document
-from slipcar.evaluation.report_scene import scene
+from slipcar.evaluation.report.comparison import TAILS, document, duration, save, save_document
+from slipcar.evaluation.report.document import Figure, read_document
+from slipcar.evaluation.report.scene import scene
 from slipcar.evaluation.runs import Runs
 from slipcar.planner import Feedback, OpenLoop, plan
 
@@ -163,7 +163,7 @@ def test_save_writes_what_a_report_needs(compared, tmp_path):
 
 def test_figures_are_listed_in_order_and_the_same_every_time(compared, tmp_path):
     pytest.importorskip("matplotlib")
-    from slipcar.evaluation import plots
+    from slipcar.evaluation.figures import saved as plots
 
     def draw():
         return [

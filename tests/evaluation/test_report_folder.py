@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipcar.evaluation import report_folder
 from slipcar.evaluation.cli import main
-from slipcar.evaluation.cli_report import report
-from slipcar.evaluation.document import Document, Figure, Table
+from slipcar.evaluation.commands.report import report
+from slipcar.evaluation.report import folder as report_folder
+from slipcar.evaluation.report.document import Document, Figure, Table
 
 
 def result(kind, title, **frames):

@@ -6,10 +6,9 @@ import re
 import numpy as np
 import pytest
 
-from slipcar.evaluation.cli_reproduce import reproduce as command
-from slipcar.evaluation.document import read_document
-from slipcar.evaluation.reproduce import reproduce
-from slipcar.evaluation.reproduce_claims import (
+from slipcar.evaluation.commands.reproduce import reproduce as command
+from slipcar.evaluation.report.document import read_document
+from slipcar.evaluation.reproduction.claims import (
     DIFFERS,
     NOT_AS_PRINTED,
     NOT_RUN,
@@ -18,8 +17,9 @@ from slipcar.evaluation.reproduce_claims import (
     agrees,
     claims,
 )
-from slipcar.evaluation.reproduce_discrepancies import discrepancies
-from slipcar.evaluation.reproduce_runs import PLANS, reference_file
+from slipcar.evaluation.reproduction.discrepancies import discrepancies
+from slipcar.evaluation.reproduction.reproduce import reproduce
+from slipcar.evaluation.reproduction.runs import PLANS, reference_file
 from slipcar.planner import plan
 
 EPISODES = 4000
@@ -149,14 +149,14 @@ def test_the_command_writes_tables_figures_and_the_page(done, tmp_path, capsys):
 
 
 def test_what_is_not_there_is_not_run_and_said(monkeypatch):
-    monkeypatch.setattr("slipcar.evaluation.reproduce.reference_file", lambda: None)
+    monkeypatch.setattr("slipcar.evaluation.reproduction.reproduce.reference_file", lambda: None)
 
     def bare(problem, solver="structured", **options):
         if solver != "structured":
             raise ImportError(f"{solver} is not installed")
         return plan(problem, **options)
 
-    monkeypatch.setattr("slipcar.evaluation.reproduce_runs.plan", bare)
+    monkeypatch.setattr("slipcar.evaluation.reproduction.runs.plan", bare)
     found = reproduce(50)
     assert not found.agreement
     verdict = {claim.name: claim.verdict for claim in claims(found)}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from slipcar.evaluation import sample_paths
-from slipcar.evaluation.reproduce_runs import path_moments, played, trace_integral
-from slipcar.evaluation.reproduce_variants import (
+from slipcar.evaluation.reproduction.runs import path_moments, played, trace_integral
+from slipcar.evaluation.reproduction.variants import (
     PrintedPotential,
     iterations_needed,
     out_of_reach,

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.evaluation import evaluate, suite_horizon, suite_random, suite_slip
+from slipcar.evaluation import evaluate
 from slipcar.evaluation.makers import Maker
-from slipcar.evaluation.suites import Suite, SuiteResult, Variant, run_suite, save_suite
+from slipcar.evaluation.suites import horizon as suite_horizon
+from slipcar.evaluation.suites import random as suite_random
+from slipcar.evaluation.suites import slip as suite_slip
+from slipcar.evaluation.suites.suite import Suite, SuiteResult, Variant, run_suite, save_suite
 from slipcar.planner import OpenLoop, plan
 
 

@@ -1,0 +1,1 @@
+"""What is shown of results: tables, texts, files, and one page of all."""

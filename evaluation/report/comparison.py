@@ -1,0 +1,404 @@
+"""A comparison as a document (tables, figures, raw numbers), as JSON, and as a folder of all."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from slipcar.evaluation import learning
+from slipcar.evaluation.cells import controller_fingerprint
+from slipcar.evaluation.report.document import (
+    NONE,
+    Column,
+    Document,
+    Figure,
+    Table,
+    plain,
+    table_of,
+    write_texts,
+)
+from slipcar.evaluation.runs import Runs
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Group
+
+    from slipcar.evaluation.compare import Comparison
+
+
+def with_error(key: str) -> Callable[[Any], str]:
+    """Text of a mean and its standard error."""
+    return lambda row: f"{row[key]:.3f} ± {row[f'{key}_se']:.3f}"
+
+
+def collisions(digits: int, key: str = "collision") -> Callable[[Any], str]:
+    """Text of a rate of collisions and its interval, in percent."""
+
+    def text(row: Any) -> str:
+        rate, low, high = (100 * row[f"{key}_{part}"] for part in ("rate", "low", "high"))
+        return f"{rate:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+    return text
+
+
+def _difference(key: str, scale: float, digits: int) -> Callable[[Any], str]:
+    def text(row: Any) -> str:
+        mean, low, high = (scale * row[f"{key}{part}"] for part in ("", "_low", "_high"))
+        return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+
+    return text
+
+
+def number(key: str, digits: int, scale: float = 1.0) -> Callable[[Any], str]:
+    """Text of a number."""
+    # + 0.0: no "-0.000"
+    return lambda row: f"{round(scale * row[key], digits) + 0.0:.{digits}f}"
+
+
+def duration(key: str) -> Callable[[Any], str]:
+    """Text of seconds, in the unit that suits them."""
+
+    def text(row: Any) -> str:
+        seconds = row[key]
+        for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+            if seconds >= size:
+                return f"{seconds / size:.3g} {unit}"
+        if seconds != seconds:
+            return NONE
+        return f"{seconds / 1e-9:.3g} ns" if seconds > 0.0 else "0 s"
+
+    return text
+
+
+LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
+TOTAL = Column("total cost", with_error("total"), "total")
+COLLISIONS = Column("collisions [%]", collisions(2), "collision_rate")
+_PARTS = ("effort", "obstacle", "goal")
+COST = (LOOP, TOTAL, *(Column(part, with_error(part), value=part) for part in _PARTS), COLLISIONS)
+#: The same for a terminal, where columns are dear.
+COST_BRIEF = (
+    *(LOOP, TOTAL),
+    *(Column(part, number(part, 3), value=part) for part in _PARTS),
+    COLLISIONS,
+)
+BETWEEN = (
+    LOOP,
+    Column("at nodes [%]", collisions(2), "collision_rate"),
+    Column("at or between nodes [%]", collisions(2, "between"), "between_rate"),
+)
+DIFFERENCE = (
+    LOOP,
+    Column("Δ total cost", _difference("total_difference", 1.0, 3), value="total_difference"),
+    Column(
+        "Δ collisions [% points]",
+        _difference("collision_difference", 100.0, 2),
+        value="collision_difference",
+    ),
+    Column(
+        "at or between nodes",
+        _difference("between_difference", 100.0, 2),
+        value="between_difference",
+    ),
+)
+TAILS = (
+    LOOP,
+    *(
+        Column(f"cost {quantile} %", number(f"total_p{quantile}", 3), f"total_p{quantile}")
+        for quantile in (50, 95, 99)
+    ),
+    Column("dearest 5 %", with_error("total_cvar95"), "total_cvar95"),
+    *(
+        Column(f"clearance {int(quantile)} % [m]", number(key, 3), key, -1)
+        for quantile in ("50", "05", "01")
+        for key in (f"clearance_p{quantile}",)
+    ),
+    Column("closest 5 % [m]", number("clearance_cvar05", 3), "clearance_cvar05", -1),
+)
+ACCURACY = (
+    LOOP,
+    Column("position RMS [m]", number("position_rms", 4), "position_rms"),
+    Column("heading RMS [rad]", number("heading_rms", 4), "heading_rms"),
+    Column("speed RMS [m/s]", number("speed_rms", 4), "speed_rms"),
+)
+WORK = (
+    LOOP,
+    Column("solver failures", lambda row: f"{int(row['failures'])}", value="failures"),
+    Column("inference per step", duration("inference_time"), value="inference_time"),
+    Column("planning or training", duration("preparation_time"), value="preparation_time"),
+)
+TRAINING = (
+    Column("training", lambda row: str(row["training"])),
+    Column("total cost", lambda row: str(row["total_text"]), value="total"),
+    Column("spread of cost", number("total_spread", 3), value="total_spread"),
+    Column("collisions [%]", lambda row: str(row["collision_text"]), value="collision_rate"),
+    Column("spread [% points]", number("collision_spread", 2, 100.0), value="collision_spread"),
+)
+#: Captions of the figures that `plots.save_all` draws, in the order in which they are shown.
+FIGURES = {
+    "tradeoff": "What a path costs on average, against how often it collides, with 95 % intervals.",
+    "learning": "Validation cost of the trainings, best so far, against samples and time: median "
+    "and range over seeds; plans are level lines.",
+    "distributions": "How the cost of a path is distributed, and its dear tail.",
+    "iterations": "Every accepted iterate of the reference plan, and sample paths of the last.",
+    "covariance": "The plan's predicted covariance against Monte Carlo.",
+}
+
+
+def tables(comparison: Comparison, brief: bool = False) -> tuple[Table, ...]:
+    """The printed tables, in order."""
+    captioned: list[tuple[str, tuple[Column, ...]]] = [
+        (
+            "Cost of a path (mean ± standard error) and collisions (Wilson 95 % interval)",
+            COST_BRIEF if brief else COST,
+        ),
+        (
+            "Collisions: at a node, and at or between nodes (Brownian bridges between them); "
+            "Wilson 95 % intervals",
+            BETWEEN,
+        ),
+        (
+            f"Paired difference to “{comparison.reference}” on the same Brownian paths "
+            "(BCa bootstrap 95 % interval)",
+            DIFFERENCE,
+        ),
+        (
+            "Tails: quantiles of the cost, and the mean of the dearest 5 % (CVaR ± standard "
+            "error); quantiles of the smallest distance to a rim, and the mean of the closest 5 %",
+            TAILS,
+        ),
+        ("Error at the goal", ACCURACY),
+    ]
+    frame = comparison.frame
+    done = [table_of(frame, caption, columns) for caption, columns in captioned]
+    trainings = training_frame(frame, comparison)
+    if len(trainings):
+        caption = (
+            "Training noise: learners trained from several seeds (mean, its error from trainings "
+            "and paths together, and the standard deviation between trainings), then each "
+            "training. In all tables their intervals are Student's t over trainings and paths"
+        )
+        done.append(table_of(trainings, caption, TRAINING))
+    learned = learning.table(comparison)
+    if learned is not None:
+        done.append(learned)
+    caption = "Solver failures and time (inference: 1024 episodes at once, time for one)"
+    return (*done, table_of(frame, caption, WORK))
+
+
+def training_frame(frame: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
+    """Rows of which several trainings were driven, each followed by its trainings."""
+    import pandas as pd
+
+    found: list[tuple[str, str, Mapping[Any, Any]]] = []
+    for name, result in comparison.results.items():
+        if len(result.runs) < 2:
+            continue
+        controller = comparison.controllers[name]
+        labels = controller.labels if isinstance(controller, Runs) else ()
+        found.append((name, f"all {len(result.runs)}", frame.loc[name].to_dict()))
+        each = zip(labels, result.runs, strict=True)
+        found += [(name, label, run.summary()) for label, run in each]
+    keys = ("total", "total_se", "total_spread", "collision_rate", "collision_spread")
+    rows = [
+        {
+            "training": training,
+            **{key: row.get(key, float("nan")) for key in keys},
+            "total_text": with_error("total")(row),
+            "collision_text": collisions(2)(row),
+        }
+        for _, training, row in found
+    ]
+    index = pd.Index([name for name, _, _ in found], name="controller")
+    return pd.DataFrame(rows, index=index)
+
+
+def frames(frame: pd.DataFrame, comparison: Comparison) -> dict[str, pd.DataFrame]:
+    """Raw numbers by file: `table`, which is the same wherever it is computed, and `times`."""
+    import pandas as pd
+
+    timed = [name for name in frame if str(name).endswith("_time")]
+    wall = {name: result.wall_time for name, result in comparison.results.items()}
+    times = frame[timed].assign(wall_time=pd.Series(wall, dtype=float))
+    named = {"table": frame.drop(columns=timed), "times": times}
+    trainings = training_frame(frame, comparison)
+    if len(trainings):
+        named["trainings"] = trainings.drop(columns=["total_text", "collision_text"])
+    learned = learning.frame(comparison)
+    if len(learned):
+        named["learning"] = learned.drop(columns=["planning_time"])  # differs from run to run
+    return named
+
+
+def setting(comparison: Comparison, fewer: bool = True) -> str:
+    """A sentence on what was run.
+
+    Args:
+        comparison: it.
+        fewer: whether to tell of rows that drove fewer episodes than others.
+    """
+    scenario = comparison.scenario
+    counts = [result.episodes for result in comparison.results.values()] if fewer else []
+    least = min(counts, default=comparison.episodes)
+    episodes = f"{least:,} to " if least < comparison.episodes else ""
+    steps = f" ({comparison.substeps} Euler–Maruyama steps each)" if comparison.substeps > 1 else ""
+    return (
+        f"{episodes}{comparison.episodes:,} episodes a row, seed {comparison.seed}, every row over "
+        f"the same Brownian paths; {scenario.nodes - 1} control steps of {scenario.dt:g} s"
+        f"{steps}, {len(scenario.obstacles)} obstacles."
+    )
+
+
+def messages(comparison: Comparison) -> tuple[str, ...]:
+    """What a reader must be told: the comparison's notes, and rows that failed."""
+    errors = comparison.errors.items()
+    return (*comparison.warnings, *(f"{name} did not finish: {text}" for name, text in errors))
+
+
+def document(
+    comparison: Comparison,
+    *,
+    title: str = "Comparison",
+    notes: tuple[str, ...] = (),
+    brief: bool = False,
+) -> Document:
+    """What a comparison has to show; figures and scene are added by :func:`save`.
+
+    Args:
+        comparison: what was run.
+        title: of its section in a report.
+        notes: what a reader must be told besides what the comparison says itself.
+        brief: with fewer columns, for a terminal.
+    """
+    return Document(
+        kind="compare",
+        title=title,
+        setting=setting(comparison),
+        tables=tables(comparison, brief),
+        notes=(*notes, *messages(comparison)),
+        figures=(),
+        frames=frames(comparison.frame, comparison),
+        provenance=comparison.provenance,
+    )
+
+
+def markdown(comparison: Comparison) -> str:
+    """Tables in Markdown with their captions, notes and provenance."""
+    return document(comparison).markdown()
+
+
+def latex(comparison: Comparison) -> str:
+    r"""Tables in LaTeX; they need `\usepackage{booktabs}`."""
+    return document(comparison).latex()
+
+
+def terminal(comparison: Comparison) -> Group:
+    """Tables for a terminal, to be printed by a rich console."""
+    return document(comparison, brief=True).terminal()
+
+
+def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
+    """Everything needed to repeat the table, and its raw numbers, as JSON.
+
+    Args:
+        comparison: what was run.
+        frame: a row for each controller; None takes the comparison's own.
+    """
+    frame = comparison.frame if frame is None else frame
+    data = {
+        "scenario": comparison.scenario.to_dict(),
+        "seed": comparison.seed,
+        "episodes": comparison.episodes,
+        "substeps": comparison.substeps,
+        "reference": comparison.reference,
+        "wall_time": comparison.wall_time,
+        "reused_rows": list(comparison.reused),
+        "provenance": comparison.provenance,
+        "rows": [
+            {
+                "controller": name,
+                "fingerprint": controller_fingerprint(comparison.controllers[str(name)]),
+                **{key: plain(value) for key, value in row.items()},
+            }
+            for name, row in frame.iterrows()
+        ],
+    }
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+
+
+def save(
+    comparison: Comparison,
+    folder: Path,
+    figures: bool,
+    *,
+    title: str = "Comparison",
+    notes: tuple[str, ...] = (),
+) -> list[Path]:
+    """Write the tables, the JSON, what a report needs, and the figures; see `Comparison.save`."""
+    from slipcar.evaluation.report.scene import scene
+
+    def draw() -> list[Path]:
+        from slipcar.evaluation.figures import saved as plots
+
+        return plots.save_all(comparison, folder)
+
+    shown = document(comparison, title=title, notes=notes)
+    written = write_texts(folder, {"results.json": comparison.to_json()})
+    draw_if_wanted = draw if figures else None
+    return written + save_document(
+        shown, folder, draw_if_wanted, FIGURES, lambda: scene(comparison)
+    )
+
+
+def save_document(
+    shown: Document,
+    folder: Path,
+    draw: Callable[[], list[Path]] | None = None,
+    captions: Mapping[str, str] = MappingProxyType({}),
+    animate: Callable[[], Mapping[str, Any]] | None = None,
+) -> list[Path]:
+    """Write a document, then once more with its animation and with the figures that were drawn.
+
+    What takes long or can fail comes after the tables are there.
+
+    Args:
+        shown: without figures and scene.
+        folder: made if it does not exist.
+        draw: draws into the folder and returns the files; None for no figures.
+        captions: stem -> caption, in the order in which figures are shown.
+        animate: makes the scene; None for no animation.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ImportError: without matplotlib; the tables are there all the same.
+    """
+    written = shown.save(folder)
+    if animate is not None:
+        shown = dataclasses.replace(shown, scene=animate())
+        shown.save(folder)
+    if draw is not None:
+        with tables_are_in(folder):
+            drawn = draw()
+        stems = {path.stem for path in drawn}
+        figures = tuple(Figure(stem, text) for stem, text in captions.items() if stem in stems)
+        dataclasses.replace(shown, figures=figures).save(folder)
+        written += drawn
+    return written
+
+
+@contextlib.contextmanager
+def tables_are_in(folder: Path) -> Iterator[None]:
+    """Where matplotlib is missing: say so, how to do without, and that the tables are there."""
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"figures need matplotlib ({error}): pip install 'slipcar[plot]', or do without "
+            f"(figures=False, --no-figures); the tables are in {folder}"
+        ) from error

@@ -1,0 +1,358 @@
+"""What a command of the evaluation has to show, as plain data: the source of every rendering.
+
+A :class:`Document` holds tables (text, and the numbers to sort by), figures (file names), raw
+numbers and where they come from. Terminal, Markdown, LaTeX and the HTML page are made of it, and
+`document.json` brings it back, so a report needs neither controllers nor planner.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slipcar.baselines.files import write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Group
+
+#: Of document.json; raised when a reader of an older one would misunderstand it.
+FORMAT = 1
+#: The file that a folder of results is recognised by.
+FILE = "document.json"
+#: What is printed where there is no number.
+NONE = "–"
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """One printed table.
+
+    Attributes:
+        caption: above it.
+        headers: one a column, with its unit; the first is the row names'.
+        cells: text, [row][column].
+        values: numbers to sort by, [row][column]; None where the text is the value, or there is
+            no number.
+        bold: (row, column) of the cells that are emphasised.
+    """
+
+    caption: str
+    headers: tuple[str, ...]
+    cells: tuple[tuple[str, ...], ...]
+    values: tuple[tuple[float | None, ...], ...]
+    bold: frozenset[tuple[int, int]] = frozenset()
+
+    def __post_init__(self) -> None:
+        width, height = len(self.headers), len(self.cells)
+        if len(self.values) != height:
+            raise ValueError(
+                f"table {self.caption!r}: {height} rows of cells but {len(self.values)} of values"
+            )
+        for part in ("cells", "values"):
+            for i, row in enumerate(getattr(self, part)):
+                if len(row) != width:
+                    raise ValueError(
+                        f"table {self.caption!r}: row {i} of {part} has {len(row)} columns, "
+                        f"not {width}"
+                    )
+        if wrong := [at for at in self.bold if not (0 <= at[0] < height and 0 <= at[1] < width)]:
+            raise ValueError(f"table {self.caption!r}: bold {wrong[0]} is outside of the table")
+
+    def numeric(self, column: int) -> bool:
+        """Whether a column holds numbers, which are set flush right."""
+        if any(row[column] is not None for row in self.values):
+            return True
+        return column > 0 and all(row[column] == NONE for row in self.cells)
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A figure in the folder.
+
+    Attributes:
+        stem: its file's name without suffix; PNG, PDF and SVG lie in the folder.
+        caption: what it shows.
+    """
+
+    stem: str
+    caption: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """A column of a printed table.
+
+    Attributes:
+        header: with its unit.
+        text: from a row of the frame to what is printed.
+        best: the key whose smallest (`sign` 1) or largest (−1) value is emphasised, or None.
+        sign: see `best`.
+        marked: the key that says of each row whether it is emphasised, or None.
+        value: the key of the number to sort by; None takes `best`, and the text if that is None.
+    """
+
+    header: str
+    text: Callable[[Any], str]
+    best: str | None = None
+    sign: int = 1
+    marked: str | None = None
+    value: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Document:
+    """What a command of the evaluation has to show: the source of terminal, Markdown, LaTeX, HTML.
+
+    Attributes:
+        kind: "compare", "frontier", "suite-random", "suite-slip", "suite-horizon", "reproduce",
+            "learning".
+        title: of the section.
+        setting: a sentence or two on what was run.
+        tables: in order.
+        notes: what a reader must be told: failed rows, warnings.
+        figures: in order.
+        frames: raw numbers by name, the main one `table`; each is written as NAME.csv.
+        provenance: versions, machine, date, commit.
+        scene: what an animation needs (see :func:`slipcar.evaluation.report.scene.scene`), or None.
+    """
+
+    kind: str
+    title: str
+    setting: str
+    tables: tuple[Table, ...]
+    notes: tuple[str, ...]
+    figures: tuple[Figure, ...]
+    frames: Mapping[str, pd.DataFrame]
+    provenance: Mapping[str, Any]
+    scene: Mapping[str, Any] | None = None
+
+    def terminal(self) -> Group:
+        """For a terminal, to be printed by a rich console."""
+        from slipcar.evaluation.report import text as report_text
+
+        return report_text.terminal(self)
+
+    def markdown(self) -> str:
+        """The setting, the tables, the notes and the provenance in Markdown."""
+        from slipcar.evaluation.report import text as report_text
+
+        return report_text.markdown(self)
+
+    def latex(self) -> str:
+        r"""The tables in LaTeX; they need `\usepackage{booktabs}`."""
+        from slipcar.evaluation.report import text as report_text
+
+        return report_text.latex(self)
+
+    def to_json(self) -> str:
+        """All of it; :func:`from_json` reads it back."""
+        data = {
+            "format": FORMAT,
+            **{key: getattr(self, key) for key in ("kind", "title", "setting", "notes")},
+            "tables": [_table_to_dict(table) for table in self.tables],
+            "figures": [dataclasses.asdict(figure) for figure in self.figures],
+            "provenance": plain(self.provenance),
+            "frames": {name: _frame_to_dict(frame) for name, frame in self.frames.items()},
+            "scene": plain(self.scene),
+        }
+        return json.dumps(data, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write `table.md`, each frame as CSV, `table.tex` and `document.json`.
+
+        Each file is whole or absent. A frame `times` takes what differs from run to run, so that
+        `table.csv` is the same bytes wherever the same is computed.
+
+        Args:
+            folder: made if it does not exist.
+
+        Returns:
+            The files written.
+        """
+        texts = {
+            "table.md": self.markdown(),
+            **{f"{name}.csv": frame.to_csv() for name, frame in self.frames.items()},
+            "table.tex": self.latex(),
+            FILE: self.to_json(),
+        }
+        return write_texts(Path(folder), texts)
+
+
+def table_of(frame: pd.DataFrame, caption: str, columns: tuple[Column, ...]) -> Table:
+    """A printed table of a frame: a row a row, its index first.
+
+    The best of a column, or those marked, are emphasised; rows that print the same as the best are
+    emphasised with it. A row whose `error` (if the frame has that column) is not empty prints
+    nothing else than its name.
+    """
+    rows = [row for _, row in frame.iterrows()]
+    failed = [bool(row["error"]) if "error" in frame else False for row in rows]
+    names = tuple(str(name) for name in frame.index)
+    texts, bold = [names], set()
+    numbers: list[tuple[float | None, ...]] = [(None,) * len(rows)]
+    for j, column in enumerate(columns, start=1):
+        printed = [
+            NONE if fails else column.text(row) for fails, row in zip(failed, rows, strict=True)
+        ]
+        printed = [NONE if "nan" in text else text for text in printed]
+        if column.best is not None and sum(text != NONE for text in printed) > 1:
+            best = printed[int(np.nanargmin(column.sign * frame[column.best].astype(float)))]
+            bold |= {(i, j) for i, text in enumerate(printed) if text == best}
+        if column.marked is not None:
+            bold |= {(i, j) for i, mark in enumerate(frame[column.marked].eq(True)) if mark}
+        key = column.value or column.best
+        texts.append(tuple(printed))
+        numbers.append(
+            tuple(
+                None if key is None or text == NONE else _finite(row[key])
+                for text, row in zip(printed, rows, strict=True)
+            )
+        )
+    return Table(
+        caption=caption,
+        headers=(str(frame.index.name or "controller"), *(column.header for column in columns)),
+        cells=tuple(zip(*texts, strict=True)),
+        values=tuple(zip(*numbers, strict=True)),
+        bold=frozenset(bold),
+    )
+
+
+def _finite(value: Any) -> float | None:
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def read_document(folder: str | Path) -> Document:
+    """What :meth:`Document.save` wrote into `folder`.
+
+    Raises:
+        ValueError: for a file of another format or that is damaged, naming it.
+        OSError: if there is none, or it cannot be read.
+    """
+    path = Path(folder) / FILE
+    try:
+        text = path.read_text(encoding="utf-8")
+        return from_json(text)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{path} {error}") from error
+
+
+def from_json(text: str) -> Document:
+    """A document from :meth:`Document.to_json`.
+
+    Raises:
+        ValueError: for another format or text that is no document.
+    """
+    try:
+        data = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"is damaged: {error}") from error
+    found = data.get("format") if isinstance(data, dict) else None
+    if found != FORMAT:
+        raise ValueError(
+            f"has format {found!r}, and this slipcar reads {FORMAT}: write it again with the "
+            "command that made it"
+        )
+    try:
+        return Document(
+            **{key: str(data[key]) for key in ("kind", "title", "setting")},
+            notes=tuple(str(note) for note in data["notes"]),
+            tables=tuple(_table_from_dict(table) for table in data["tables"]),
+            figures=tuple(Figure(**figure) for figure in data["figures"]),
+            frames={name: _frame_from_dict(frame) for name, frame in data["frames"].items()},
+            provenance=dict(data["provenance"]),
+            scene=data["scene"],
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"is damaged: {type(error).__name__}: {error}") from error
+
+
+def _table_to_dict(table: Table) -> dict[str, Any]:
+    return {**plain(dataclasses.asdict(table)), "bold": sorted(table.bold)}
+
+
+def _table_from_dict(data: dict[str, Any]) -> Table:
+    return Table(
+        caption=data["caption"],
+        headers=tuple(data["headers"]),
+        cells=tuple(map(tuple, data["cells"])),
+        values=tuple(map(tuple, data["values"])),
+        bold=frozenset((int(i), int(j)) for i, j in data["bold"]),
+    )
+
+
+def _frame_to_dict(frame: pd.DataFrame) -> dict[str, Any]:
+    """Columns with their types; floats that JSON cannot say (nan, inf) as their names.
+
+    Raises:
+        ValueError: for a frame whose rows or columns have several levels of names.
+    """
+    if frame.index.nlevels > 1 or frame.columns.nlevels > 1:
+        raise ValueError(f"a frame of a document has one name a row, not {frame.index.names}")
+    return {
+        "index": {"name": frame.index.name, "values": [_spelt(value) for value in frame.index]},
+        "columns": [
+            {
+                "name": str(name),
+                "dtype": str(frame[name].dtype),
+                "values": [_spelt(value) for value in frame[name]],
+            }
+            for name in frame
+        ],
+    }
+
+
+def _spelt(value: Any) -> Any:
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"float": str(value)}
+    return value
+
+
+def _frame_from_dict(data: dict[str, Any]) -> pd.DataFrame:
+    import pandas as pd
+
+    def read(values: list[Any]) -> list[Any]:
+        return [float(value["float"]) if isinstance(value, dict) else value for value in values]
+
+    index = pd.Index(read(data["index"]["values"]), name=data["index"]["name"])
+    columns = {
+        column["name"]: pd.Series(read(column["values"]), index=index, dtype=column["dtype"])
+        for column in data["columns"]
+    }
+    return pd.DataFrame(columns, index=index)
+
+
+def plain(value: Any) -> Any:
+    """Lists, dicts, text and numbers of it; JSON has no NaN and no infinity: None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(part) for part in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Write files, name -> text, into a folder that is made if need be; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, text in texts.items():
+        path = folder / name
+        write_atomically(path, text.encode())
+        written.append(path)
+    return written

@@ -1,0 +1,158 @@
+"""A document for a terminal, as Markdown and as LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from slipcar.evaluation.report.document import Document, Table
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+
+def machine(provenance: Mapping[str, Any]) -> str:
+    """A sentence on where numbers were computed; says what it is told and no more."""
+    parts = [str(provenance["cpu"])] if provenance.get("cpu") else []
+    if provenance.get("python"):
+        parts.append(f"Python {provenance['python']}")
+    parts += [f"{name} {version}" for name, version in (provenance.get("versions") or {}).items()]
+    if provenance.get("commit"):
+        parts.append(f"commit {provenance['commit'][:12]}")
+    if provenance.get("date"):
+        parts.append(str(provenance["date"]))
+    return ", ".join(parts) + "." if parts else ""
+
+
+def markdown(document: Document) -> str:
+    """Tables in Markdown with their captions, notes and provenance."""
+    parts = [prose(document.setting)] if document.setting else []
+    for table in document.tables:
+        parts += [f"**{prose(table.caption)}**", markdown_table(table)]
+    parts += [prose(note) for note in document.notes]
+    if told := machine(document.provenance):
+        parts.append(f"Computed on {told}")
+    return "\n\n".join(parts) + "\n"
+
+
+def markdown_table(table: Table) -> str:
+    """A table in Markdown (GitHub's), without its caption."""
+    from tabulate import tabulate
+
+    rows = [
+        [
+            f"**{_markdown(text)}**" if (i, j) in table.bold else _markdown(text)
+            for j, text in enumerate(row)
+        ]
+        for i, row in enumerate(table.cells)
+    ]
+    headers = [_markdown(header) for header in table.headers]
+    return tabulate(rows, headers, tablefmt="github", disable_numparse=True)
+
+
+def csv_table(table: Table) -> str:
+    """A table as CSV, as it is printed; raw numbers are in the frames."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([table.headers, *table.cells])
+    return text.getvalue()
+
+
+def prose(text: str) -> str:
+    """A paragraph in Markdown: names in it begin no tag."""
+    return re.sub(r"<(?=[A-Za-z/!?])", r"\<", text)
+
+
+def _markdown(text: str) -> str:
+    """What would end a cell or begin a tag is escaped."""
+    return re.sub(r"([\\|<*`])", r"\\\1", " ".join(text.split()))
+
+
+def latex(document: Document) -> str:
+    r"""Floating tables in LaTeX; they need `\usepackage{booktabs}`."""
+    remarks = [document.setting, machine(document.provenance), *document.notes]
+    parts = [f"% {' '.join(remark.split())}" for remark in remarks if remark]
+    return "\n".join([*parts, *(latex_table(table) for table in document.tables)])
+
+
+def latex_table(table: Table) -> str:
+    """A floating table in LaTeX."""
+    import pandas as pd
+
+    rows = [
+        [
+            rf"\textbf{{{tex(text)}}}" if (i, j) in table.bold else tex(text)
+            for j, text in enumerate(row)
+        ]
+        for i, row in enumerate(table.cells)
+    ]
+    escaped = pd.DataFrame(rows, columns=range(len(table.headers)))
+    escaped.columns = pd.Index([tex(header) for header in table.headers])
+    return escaped.to_latex(
+        index=False,
+        escape=False,
+        caption=tex(table.caption) + ".",
+        column_format="".join("r" if table.numeric(j) else "l" for j in range(len(table.headers))),
+        position="htb",
+    )
+
+
+_GREEK = (
+    "alpha beta gamma delta varepsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau "
+    "upsilon varphi chi psi omega Gamma Delta Theta Lambda Xi Pi Sigma Phi Psi Omega"
+)
+_TEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": r"$<$", ">": r"$>$", "|": r"$|$", "\n": " ", "\r": " ", "\t": " ",
+    "±": r"$\pm$", "µ": r"\textmu{}", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$",
+    "−": r"$-$", "·": r"$\cdot$", "→": r"$\to$", "≈": r"$\approx$", "∞": r"$\infty$",
+    "∫": r"$\int$", "√": r"$\surd$", "‖": r"$\|$", "∈": r"$\in$", "≠": r"$\neq$", "°": r"$^\circ$",
+    "“": "``", "”": "\'\'", "„": r"\quotedblbase{}", "’": "'", "–": "--", "—": "---",
+    "…": r"\ldots{}", "\u00a0": "~", "\u202f": r"\,", "\u2009": r"\,",
+    **dict(zip("⁰¹²³⁴⁵⁶⁷⁸⁹", (f"$^{i}$" for i in range(10)), strict=True)), "⁻": "$^-$",
+    **dict(zip("₀₁₂₃₄₅₆₇₈₉", (f"$_{i}$" for i in range(10)), strict=True)),
+    **{
+        letter: f"$\\{name}$"
+        for letter, name in zip("αβγδεζηθικλμνξπρστυφχψωΓΔΘΛΞΠΣΦΨΩ", _GREEK.split(), strict=True)
+    },
+}  # fmt: skip
+
+
+def tex(text: str) -> str:
+    """Text with what LaTeX would take as commands escaped."""
+    return "".join(_TEX.get(letter, letter) for letter in text)
+
+
+def terminal(document: Document) -> Group:
+    """Tables for a terminal, to be printed by a rich console."""
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[Any] = [Text(document.setting), Text()]
+    for table in document.tables:
+        parts += [Text(table.caption, style="bold"), terminal_table(table)]
+    parts += [Text(note, style="bold red") for note in document.notes]
+    return Group(*parts)
+
+
+def terminal_table(table: Table) -> Any:
+    """A table of rich."""
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    drawn = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, header_style="")
+    for j, header in enumerate(table.headers):
+        justify: Any = "right" if table.numeric(j) else "left"
+        drawn.add_column(Text(header), justify=justify, no_wrap=j == 0)
+    for i, row in enumerate(table.cells):
+        drawn.add_row(
+            *(
+                Text(text, style="bold green" if (i, j) in table.bold else "")
+                for j, text in enumerate(row)
+            )
+        )
+    return drawn

@@ -1,0 +1,1 @@
+"""The paper's section 6, claim by claim, beside what we get."""

@@ -1,0 +1,202 @@
+"""Held-out random worlds: does it work elsewhere than where it was tuned?
+
+Planners plan each world; the policies were trained on worlds of the same family, and see the
+obstacles, but never saw these. Worlds are the sampling unit: every number is a mean over worlds,
+and its interval says how far another hundred worlds would differ.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slipcar.envs.families import Family
+from slipcar.evaluation.learned import learned_rows
+from slipcar.evaluation.makers import Maker
+from slipcar.evaluation.report.document import Column, Document, Figure, table_of
+from slipcar.evaluation.statistics import bca_interval, standard_error
+from slipcar.evaluation.suites.suite import Suite, SuiteResult, Variant
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: The family whose policies are shipped, and what its worlds are called.
+FAMILY = "random"
+EPISODES, WORLDS = 512, 100
+REFERENCE = "stochastic SCP + feedback"
+
+
+def suite(episodes: int = EPISODES, worlds: int = WORLDS) -> Suite:
+    """100 held-out worlds of the family of random ones.
+
+    Args:
+        episodes: of each row in each world, >= 1.
+        worlds: the first so many of the 100, >= 1.
+
+    Raises:
+        ValueError: for more worlds than there are.
+    """
+    rows: dict[str, Any] = {
+        "straight (ignores obstacles)": Maker.of("straight"),
+        "deterministic SCP": Maker.of("deterministic"),
+        "stochastic SCP": Maker.of("stochastic"),
+        REFERENCE: Maker.of("feedback"),
+        "planned feedback": Maker.of("planned-feedback"),
+        "planned feedback, 8 starts": Maker.of("planned-feedback", starts=8),
+        "planned feedback, risk ≤ 1 %": Maker.of("planned-feedback", risk=0.01),
+        "receding horizon": Maker.of("receding"),
+        **learned_rows(FAMILY),
+    }
+    held_out = Family.named(FAMILY).held_out(worlds)
+    variants = [
+        Variant(f"world {number}", float(number), scenario)
+        for number, scenario in enumerate(held_out)
+    ]
+    return Suite("random", "world", rows, variants, episodes, REFERENCE)
+
+
+def document(result: SuiteResult) -> Document:
+    """Tables over worlds, and what they were made of."""
+    frame = over_worlds(result)
+    worlds = len(result.suite.variants)
+    tables = (
+        table_of(
+            frame,
+            f"Over {worlds} held-out worlds: means of the worlds' means ± standard error over "
+            "worlds; median world; share of worlds whose plan failed",
+            _COST,
+        ),
+        table_of(
+            frame,
+            "Collisions: mean over worlds (BCa bootstrap 95 % interval over worlds), worst world",
+            _COLLISIONS,
+        ),
+        table_of(
+            frame,
+            f"Paired difference to “{result.suite.reference}” in the same worlds on the same "
+            "Brownian paths (BCa bootstrap 95 % interval over worlds), and in how many it is "
+            "cheaper",
+            _DIFFERENCES,
+        ),
+    )
+    from slipcar.evaluation.suites.shared import frames, notes
+
+    return Document(
+        kind="suite-random",
+        title="Held-out random worlds",
+        setting=(
+            f"{worlds} worlds of the family “{FAMILY}” that nothing was trained or tuned on, "
+            f"{result.suite.episodes:,} episodes of each row in each, seed {result.seed}. Planners "
+            "plan for each world; policies were trained on other worlds of the family."
+        ),
+        tables=tables,
+        notes=notes(result),
+        figures=(
+            Figure(
+                "random",
+                "Each line: the worlds, sorted. Left: cost, relative to the reference row in the "
+                "same world. Right: collision rate.",
+            ),
+        ),
+        frames={"table": frame, **frames(result)},
+        provenance=result.provenance,
+    )
+
+
+def over_worlds(result: SuiteResult) -> pd.DataFrame:
+    """One line a row: aggregates over worlds."""
+    import pandas as pd
+
+    lines = {}
+    whole = result.frame
+    base = whole[whole["controller"] == result.suite.reference].set_index("variant")
+    for row in result.suite.rows:
+        mine = whole[whole["controller"] == row].set_index("variant")
+        finished = mine[mine["error"] == ""]
+        line: dict[str, Any] = {"worlds": len(finished), "error": ""}
+        if len(finished) == 0:
+            line["error"] = str(mine["error"].iloc[0])
+        else:
+            totals = finished["total"].to_numpy(dtype=float)
+            rates = finished["collision_rate"].to_numpy(dtype=float)
+            line |= {
+                "closed_loop": bool(finished["closed_loop"].iloc[0]),
+                "runs": int(finished["runs"].iloc[0]),
+                "total": totals.mean(),
+                "total_se": standard_error(totals),
+                "total_median": float(np.median(totals)),
+                "effort": float(finished["effort"].mean()),
+                "failed": float((finished["failures"] > 0).mean()),
+                **_interval("collision", bca_interval(rates)),
+                "collision_worst": rates.max(),
+                "collision_free": float((rates == 0.0).mean()),
+                "between_rate": float(finished["between_rate"].mean()),
+            }
+            if row != result.suite.reference:
+                common = [label for label in finished.index if base["error"].get(label) == ""]
+                paired = finished.loc[common], base.loc[common]
+                for metric in ("total", "collision_rate"):
+                    difference = (paired[0][metric] - paired[1][metric]).to_numpy(dtype=float)
+                    name = f"{metric.removesuffix('_rate')}_difference"
+                    if len(difference):
+                        line |= _interval(name, bca_interval(difference), mean=name)
+                    if metric == "total":
+                        line["cheaper"] = float((difference < 0.0).mean())
+        lines[row] = line
+    columns = list(dict.fromkeys(key for line in lines.values() for key in line if key != "error"))
+    frame = pd.DataFrame.from_dict(lines, orient="index", columns=[*columns, "error"])
+    return frame.rename_axis("controller")
+
+
+def _interval(name: str, found: Any, mean: str | None = None) -> dict[str, float]:
+    return {
+        mean or f"{name}_rate": found.mean,
+        f"{name}_low": found.low,
+        f"{name}_high": found.high,
+    }
+
+
+def _percent(key: str, digits: int = 2) -> Any:
+    return lambda row: f"{100.0 * row[key]:.{digits}f}"
+
+
+def _with_interval(key: str, ends: str, scale: float, digits: int, sign: str = "") -> Any:
+    def text(row: Any) -> str:
+        mean, low, high = (scale * row[k] for k in (key, f"{ends}_low", f"{ends}_high"))
+        return f"{mean:{sign}.{digits}f} [{low:{sign}.{digits}f}, {high:{sign}.{digits}f}]"
+
+    return text
+
+
+_LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
+_COST = (
+    _LOOP,
+    Column("total cost", lambda row: f"{row['total']:.2f} ± {row['total_se']:.2f}", "total"),
+    Column("median world", lambda row: f"{row['total_median']:.2f}", "total_median"),
+    Column("effort", lambda row: f"{row['effort']:.2f}", value="effort"),
+    Column("plans failed [% of worlds]", _percent("failed", 0), value="failed"),
+)
+_COLLISIONS = (
+    _LOOP,
+    Column(
+        "collisions [%]", _with_interval("collision_rate", "collision", 100, 2), "collision_rate"
+    ),
+    Column("at or between nodes [%]", _percent("between_rate"), "between_rate"),
+    Column("worst world [%]", _percent("collision_worst", 1), "collision_worst"),
+    Column("worlds without any [%]", _percent("collision_free", 0), "collision_free", -1),
+)
+_DIFFERENCES = (
+    _LOOP,
+    Column(
+        "Δ total cost",
+        _with_interval("total_difference", "total_difference", 1.0, 3, "+"),
+        value="total_difference",
+    ),
+    Column("cheaper in [% of worlds]", _percent("cheaper", 0), value="cheaper"),
+    Column(
+        "Δ collisions [% points]",
+        _with_interval("collision_difference", "collision_difference", 100.0, 2, "+"),
+        value="collision_difference",
+    ),
+)

@@ -1,0 +1,256 @@
+"""Suites: the same rows in many worlds, one table and one figure each.
+
+    paper     the paper's scenario (:mod:`slipcar.evaluation.compare`)
+    random    100 held-out worlds of a family, every planner plans each of them
+    slip      the paper's scenario with α² from 0 to 1: where do the methods cross?
+    horizon   plans with few and many nodes, driven in a finer stochastic differential equation
+
+A suite is a list of variants (a world, how finely it is simulated) and of rows (planners that are
+made for each world, policies that are not). All variants meet the same seed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from slipcar.envs.scenario import Scenario
+from slipcar.evaluation.cells import Store
+from slipcar.evaluation.controller import Controller
+from slipcar.evaluation.executors import open_executor
+from slipcar.evaluation.metrics import Result
+from slipcar.evaluation.progress import Bars
+from slipcar.evaluation.provenance import provenance
+from slipcar.evaluation.rollout import check_counts
+from slipcar.evaluation.runs import Runs
+from slipcar.evaluation.sweep import TIME_LIMIT, Job, sweep
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from slipcar.evaluation.report.document import Document
+
+#: What a row may be: a function of the scenario that makes its controller, called by a worker for
+#: each world (a :class:`slipcar.evaluation.makers.Maker`, or a user's own); or brought along, once
+#: or in several trainings.
+Row = Callable[[Scenario], Controller] | Controller | Runs
+#: Columns that differ from run to run: they go to a file of their own.
+TIMES = ("inference_time", "preparation_time")
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A world of a suite.
+
+    Attributes:
+        label: in the tables.
+        value: of what varies: α², the number of nodes, the number of the world.
+        scenario: where.
+        substeps: Euler–Maruyama steps in each control interval.
+    """
+
+    label: str
+    value: float
+    scenario: Scenario
+    substeps: int = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """What is to be run.
+
+    Attributes:
+        name: "random", "slip", "horizon".
+        varied: what varies from variant to variant, with its unit.
+        rows: by name, in the order of the tables.
+        variants: in order.
+        episodes: of each row in each variant.
+        reference: row that others are compared with.
+        notes: what a reader must be told beforehand.
+    """
+
+    name: str
+    varied: str
+    rows: Mapping[str, Row]
+    variants: Sequence[Variant]
+    episodes: int
+    reference: str
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class SuiteResult:
+    """What came of a suite.
+
+    Attributes:
+        suite: what was run.
+        seed: of the Brownian paths.
+        results: (row, variant's label) -> result, of what finished.
+        errors: (row, variant's label) -> message.
+        computed: cells that were computed; the others were there.
+        warnings: what a reader must be told.
+        wall_time: seconds it took.
+        provenance: versions, machine, date, commit.
+    """
+
+    suite: Suite
+    seed: int
+    results: dict[tuple[str, str], Result]
+    errors: dict[tuple[str, str], str]
+    computed: int
+    warnings: tuple[str, ...]
+    wall_time: float
+    provenance: dict[str, Any]
+
+    @functools.cached_property
+    def frame(self) -> pd.DataFrame:
+        """One line a row and variant, raw numbers in SI units; differences are to the reference."""
+        import pandas as pd
+
+        lines = []
+        for row in self.suite.rows:
+            for variant in self.suite.variants:
+                line: dict[str, Any] = {
+                    "controller": row,
+                    "variant": variant.label,
+                    "value": variant.value,
+                    "nodes": variant.scenario.nodes,
+                    "substeps": variant.substeps,
+                }
+                result = self.results.get((row, variant.label))
+                if result is not None:
+                    line |= result.summary()
+                    line |= self._difference(row, variant.label)
+                line["error"] = self.errors.get((row, variant.label), "")
+                lines.append(line)
+        return pd.DataFrame(lines)
+
+    def _difference(self, row: str, label: str) -> dict[str, float]:
+        reference = self.results.get((self.suite.reference, label))
+        if reference is None or row == self.suite.reference:
+            return {}
+        found = self.results[row, label].difference(reference, "total")
+        return {f"total_difference{end}": value for end, value in zip(
+            ("", "_low", "_high"), found, strict=True
+        )}  # fmt: skip
+
+    @property
+    def failed(self) -> list[str]:
+        """One line for each row that raised somewhere."""
+        lines = []
+        for row in self.suite.rows:
+            where = [label for name, label in self.errors if name == row]
+            if where:
+                first = self.errors[row, where[0]]
+                others = f" and {len(where) - 1} more" if len(where) > 1 else ""
+                lines.append(f"{row} did not finish in {where[0]}{others}: {first}")
+        return lines
+
+
+def run_suite(
+    suite: Suite,
+    seed: int = 0,
+    *,
+    n_jobs: int = 1,
+    cluster: str | None = None,
+    folder: str | Path | None = None,
+    resume: bool = True,
+    time_limit: float | None = TIME_LIMIT,
+    progress: bool = True,
+) -> SuiteResult:
+    """Drive every row in every variant.
+
+    Args:
+        suite: see :mod:`slipcar.evaluation.suites.suite`.
+        seed: of the Brownian paths, >= 0; the same in all variants.
+        n_jobs: worker processes on this machine; they plan, too. The numbers do not depend on it.
+        cluster: None, or a Dask cluster: see :func:`slipcar.evaluation.executors.open_executor`.
+        folder: where finished cells are kept, so that an interrupted suite continues; or None.
+        resume: whether to reuse finished cells of `folder`.
+        time_limit: seconds that a row may take for 1024 episodes; None is no limit.
+        progress: whether to show a bar for each row.
+
+    Raises:
+        ValueError: for a bad argument.
+        OSError: if the cluster does not answer.
+        LostWorkersError: if the cluster is gone; finished work is kept.
+    """
+    check_counts(suite.episodes, seed, 1, None, n_jobs)
+    began = time.perf_counter()
+    store = Store(folder, resume)
+    jobs = [
+        Job(
+            row=row,
+            variant=f"{variant.label}\n{label}",
+            controller=one,
+            scenario=variant.scenario,
+            episodes=suite.episodes,
+            seed=seed,
+            substeps=variant.substeps,
+            time_limit=time_limit,
+        )
+        for row, controller in suite.rows.items()
+        for variant in suite.variants
+        for label, one in _trainings(controller).items()
+    ]
+    totals: dict[str, int] = {}
+    for job in jobs:
+        totals[job.row] = totals.get(job.row, 0) + job.episodes
+    with open_executor(n_jobs, cluster) as executor, Bars(totals, progress) as bars:
+        swept = sweep(jobs, store, executor, bars)
+    results, errors = {}, {}
+    for row, controller in suite.rows.items():
+        for variant in suite.variants:
+            names = [(row, f"{variant.label}\n{label}") for label in _trainings(controller)]
+            failed = [swept.errors[name] for name in names if name in swept.errors]
+            if failed:
+                errors[row, variant.label] = failed[0]
+                continue
+            parts = [swept.results[name] for name in names]
+            several = isinstance(controller, Runs)
+            results[row, variant.label] = Result.of_runs(parts) if several else parts[0]
+    return SuiteResult(
+        suite=suite,
+        seed=seed,
+        results=results,
+        errors=errors,
+        computed=swept.computed,
+        warnings=(store.trouble,) if store.trouble else (),
+        wall_time=time.perf_counter() - began,
+        provenance=provenance(),
+    )
+
+
+def _trainings(controller: Row) -> dict[str, Any]:
+    """Label -> controller of everything behind a row."""
+    if isinstance(controller, Runs):
+        return dict(zip(controller.labels, controller.controllers, strict=True))
+    return {"": controller}
+
+
+def save_suite(
+    result: SuiteResult, document: Document, folder: str | Path, figures: bool = True
+) -> list[Path]:
+    """Write a suite's tables, raw numbers and figure; returns the files written.
+
+    Args:
+        result: what came of the suite.
+        document: made of it.
+        folder: made if it does not exist.
+        figures: also draw the figure (`pip install slipcar[plot]`).
+    """
+    from slipcar.evaluation.report.comparison import save_document
+
+    def draw() -> list[Path]:
+        from slipcar.evaluation.figures import suites as plot_suites
+
+        figure = plot_suites.FIGURES[result.suite.name](result)
+        return plot_suites.save_figure(figure, Path(folder), result.suite.name)
+
+    captions = {figure.stem: figure.caption for figure in document.figures}
+    bare = dataclasses.replace(document, figures=())
+    return save_document(bare, Path(folder), draw if figures and result.results else None, captions)
