@@ -33,7 +33,7 @@ CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
 
-.PHONY: help install compare frontier test test-long train bench bench-worlds bench-docs lint types lock peers clean
+.PHONY: help install compare suites frontier reproduce report kills test test-long train bench bench-worlds bench-docs lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -45,6 +45,20 @@ install: $(INSTALLED)  ## set up .venv (every other target does it when needed)
 
 compare: $(INSTALLED)  ## the main job: SCP, feedback and PPO over the same noise; results/compare
 	$(BIN)/slipcar compare --workers $(WORKERS) $(ARGS)
+
+suites: $(INSTALLED)  ## held-out worlds, from dry to slippery, nodes and substeps; results/random, slip, horizon
+	$(BIN)/slipcar compare --suite random --workers $(WORKERS) $(ARGS)
+	$(BIN)/slipcar compare --suite slip --workers $(WORKERS) $(ARGS)
+	$(BIN)/slipcar compare --suite horizon --workers $(WORKERS) $(ARGS)
+
+reproduce: $(INSTALLED)  ## the paper's claims, one by one; results/reproduce
+	$(BIN)/slipcar reproduce --workers $(WORKERS) $(ARGS)
+
+report: $(INSTALLED)  ## one page of everything in results/: results/report.html
+	$(BIN)/slipcar report results $(ARGS)
+
+kills: $(INSTALLED)  ## kill a comparison 20 times at random moments: is anything lost?
+	$(BIN)/python benchmarks/kills.py $(ARGS)
 
 test: $(INSTALLED)  ## all tests but the long ones
 	$(BIN)/python -m pytest -n $(TESTERS) $(ARGS)
@@ -75,7 +89,7 @@ types: $(INSTALLED)  ## mypy over the installed package
 	$(BIN)/mypy
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare frontier train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
+compare suites frontier reproduce kills train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
 
 # Compiled once per machine, not once per renewed tree of links.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba

@@ -54,6 +54,10 @@ def _receding(scenario: Scenario, **options: Any) -> Controller:
     return RecedingHorizon(scenario, **options)
 
 
+def _shipped(scenario: Scenario) -> Controller:
+    return baselines.load_policy()
+
+
 #: Kind of row -> what makes it.
 KINDS: dict[str, Callable[..., Controller]] = {
     "straight": _straight,
@@ -63,6 +67,7 @@ KINDS: dict[str, Callable[..., Controller]] = {
     "chance": _chance,
     "planned-feedback": _steered,
     "receding": _receding,
+    "ppo": _shipped,
 }
 
 

@@ -30,6 +30,7 @@ def dataset(
     observation: Annotated[str, tyro.conf.arg(metavar="|".join(KINDS))] = "features",
     obstacle_slots: int = 0,
     exploration_noise: float = 0.0,
+    trust: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     folder: Path | None = None,
     overwrite: bool = False,
     author: str | None = None,
@@ -58,6 +59,7 @@ def dataset(
         obstacle_slots: how many obstacles it shows, the nearest first.
         exploration_noise: standard deviation of normal noise on each action, which lies in
             [-1, 1]; what is stored is the sum, clipped.
+        trust: load a Stable-Baselines3 model, which runs whatever code is in the file.
         folder: where Minari keeps datasets; by default MINARI_DATASETS_PATH if that is set,
             else ~/.minari/datasets.
         overwrite: replace a dataset of this id.
@@ -74,7 +76,7 @@ def dataset(
     Layout(observation, obstacle_slots)  # all that can be checked before any planning
     check_recording(episodes, seed, exploration_noise)
     check_request(dataset_id, folder, overwrite)
-    driver, world = read_controller(controller, world)
+    driver, world = read_controller(controller, world, trust)
     with _Bar(episodes) as bar:
         written = write_dataset(
             driver,

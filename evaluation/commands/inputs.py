@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,6 +56,7 @@ MAKERS = {
     "receding": Maker.of("receding"),
     "deterministic": Maker.of("deterministic"),
     "straight": Maker.of("straight"),
+    "ppo": Maker.of("ppo"),
 }
 CONTROLLER_HELP = (
     f"who drives: {', '.join(CONTROLLERS)}; a plan's .npz file (with its feedback gains if it has "
@@ -132,7 +134,8 @@ def read_controller(
         policy = baselines.load_policy(path)
         return policy, scenario or policy.scenario
     world = scenario or Scenario.named("paper")
-    return load_controller(text, world, trust=trust)[1], world
+    with _words_are_known():
+        return load_controller(text, world, trust=trust)[1], world
 
 
 def read_maker(text: str, trust: bool = False) -> tuple[str, Callable[[Scenario], Controller]]:
@@ -147,7 +150,20 @@ def read_maker(text: str, trust: bool = False) -> tuple[str, Callable[[Scenario]
     name, word = split_name(text)
     if word in MAKERS:
         return name or word, MAKERS[word]
-    return load_maker(text, trust=trust)
+    with _words_are_known():
+        return load_maker(text, trust=trust)
+
+
+@contextlib.contextmanager
+def _words_are_known() -> Iterator[None]:
+    """An unknown controller is told which words there are, beside all the other forms."""
+    try:
+        yield
+    except ValueError as error:
+        head, colon, rest = str(error).partition(": it is ")
+        if not (head.startswith("unknown controller") and colon):
+            raise
+        raise ValueError(f"{head}: it is one of {list(CONTROLLERS)}, {rest}") from None
 
 
 def console(width: int = 120) -> Console:

@@ -47,6 +47,7 @@ def simulate(
     scenario: OwnScenarioOption = None,
     episodes: int = 5,
     seed: int = 0,
+    trust: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     figure: Path | None = None,
     video: Path | None = None,
     gif: Path | None = None,
@@ -76,6 +77,7 @@ def simulate(
         scenario: which world.
         episodes: how many, at least 1; at most 50 to be filmed.
         seed: of the Brownian paths, at least 0.
+        trust: load a Stable-Baselines3 model, which runs whatever code is in the file.
         figure: draw all paths to this .png, .pdf or .svg (needs matplotlib).
         video: film the episodes, H.264 in an .mp4 (needs pygame and imageio-ffmpeg:
             slipcar[plot,video]).
@@ -98,7 +100,8 @@ def simulate(
     _check_files(figure, video, gif, frames)
     if filmed:
         _check_pictures(episodes, video is not None)
-    drives, world = read_controller(named, None if scenario is None else read_scenario(scenario))
+    world = None if scenario is None else read_scenario(scenario)
+    drives, world = read_controller(named, world, trust)
     result = evaluate(drives, world, episodes, seed)
     out.print(episodes_table(result.metrics))
     out.print(
