@@ -28,6 +28,8 @@ from slipcar.envs.scenario import Scenario
 _FAR = 4.0
 #: Newton steps towards the half plane; two or three are enough.
 _STEPS = 4
+#: No step turns it farther than this, as a tangent.
+_TURN = 0.5
 
 
 def log_clear(
@@ -56,15 +58,16 @@ def log_clear(
     slip, _ = car.slip_rates(before[3], before[4], *scenario.slip)
     variance_x = h * (slip * slip + scenario.process_noise[0] ** 2)
     variance_y = h * (slip * slip + scenario.process_noise[1] ** 2)
-    length = np.hypot(bx - ax, by - ay)
+    dx, dy = bx - ax, by - ay
+    length = np.sqrt(dx * dx + dy * dy)
     stray = 2.0 * _FAR * np.sqrt(np.maximum(variance_x, variance_y)) + length
     # No point of the chord is nearer to a rim than half of what both ends keep, less its length.
     rows = np.arange(len(length))
     if distances is not None:
         rows = np.flatnonzero(distances[0] + distances[1] <= stray)
     x, y, radius = scenario.obstacles.T[:, :, None]
-    gap_a = np.hypot(ax[rows] - x, ay[rows] - y) - radius
-    gap_b = np.hypot(bx[rows] - x, by[rows] - y) - radius
+    gap_a = np.sqrt((ax[rows] - x) ** 2 + (ay[rows] - y) ** 2) - radius
+    gap_b = np.sqrt((bx[rows] - x) ** 2 + (by[rows] - y) ** 2) - radius
     which, place = np.nonzero(gap_a + gap_b <= stray[rows])
     if not len(which):
         return total
@@ -101,36 +104,29 @@ def _touched(
     dx, dy = bx - ax, by - ay
     squared = np.maximum(dx * dx + dy * dy, 1e-300)
     along = np.clip(-(ax * dx + ay * dy) / squared, 0.0, 1.0)
-    x, y = ax + along * dx, ay + along * dy  # the chord's point nearest to the centre
-    inside = np.hypot(x, y) <= radius
-    # The normal n = (cos φ, sin φ) lies between the directions of a and b; from the nearest
-    # point's, Newton's method on the concave product of n·a − δ and n·b − δ.
-    phi = np.arctan2(y, x)
-    turn_a, turn_b = _turn(np.arctan2(ay, ax) - phi), _turn(np.arctan2(by, bx) - phi)
-    low, high = np.minimum(turn_a, turn_b), np.maximum(turn_a, turn_b)
-    rho_a, rho_b = np.hypot(ax, ay), np.hypot(bx, by)
-    turn = np.zeros(len(ax))
+    nx, ny = ax + along * dx, ay + along * dy  # the chord's point nearest to the centre
+    distance = np.sqrt(nx * nx + ny * ny)
+    inside = distance <= radius
+    nx, ny = nx / np.maximum(distance, 1e-300), ny / np.maximum(distance, 1e-300)
+    # From that point's direction, Newton's method in the angle of n on the product of n·a − δ and
+    # n·b − δ, which is concave between the directions of a and b, where its maximum lies.
     for _ in range(_STEPS):
-        cos_a, sin_a = rho_a * np.cos(turn - turn_a), rho_a * np.sin(turn - turn_a)
-        cos_b, sin_b = rho_b * np.cos(turn - turn_b), rho_b * np.sin(turn - turn_b)
-        slope = -sin_a * (cos_b - radius) - sin_b * (cos_a - radius)
-        curve = -cos_a * (cos_b - radius) - cos_b * (cos_a - radius) + 2.0 * sin_a * sin_b
+        gap_a, gap_b = nx * ax + ny * ay - radius, nx * bx + ny * by - radius
+        turn_a, turn_b = nx * ay - ny * ax, nx * by - ny * bx  # derivatives of the gaps
+        slope = turn_a * gap_b + turn_b * gap_a
+        curve = 2.0 * turn_a * turn_b - (gap_a + radius) * gap_b - (gap_b + radius) * gap_a
         step = np.where(curve < 0.0, -slope / np.minimum(curve, -1e-300), 0.0)
-        turn = np.clip(turn + step, low, high)
-    gap_a = rho_a * np.cos(turn - turn_a) - radius
-    gap_b = rho_b * np.cos(turn - turn_b) - radius
+        step = np.clip(step, -_TURN, _TURN)
+        nx, ny = nx - step * ny, ny + step * nx
+        norm = np.sqrt(nx * nx + ny * ny)
+        nx, ny = nx / norm, ny / norm
+    gap_a, gap_b = nx * ax + ny * ay - radius, nx * bx + ny * by - radius
     clear = ~inside & (gap_a > 0.0) & (gap_b > 0.0)
     gap_a, gap_b = np.where(clear, gap_a, 0.0), np.where(clear, gap_b, 0.0)
-    normal = np.cos(phi + turn) ** 2, np.sin(phi + turn) ** 2
-    variance = normal[0] * variance_x + normal[1] * variance_y
+    variance = nx * nx * variance_x + ny * ny * variance_y
     product = gap_a * gap_b
     # Without noise the path is the chord: exp(−∞).
     with np.errstate(divide="ignore", invalid="ignore"):
         straight = np.exp(-2.0 * product / variance)
         bend = np.sqrt(1.0 + 2.0 * product / (radius * (gap_a + gap_b)))
         return np.where(clear, straight / bend, 1.0)
-
-
-def _turn(angle: np.ndarray) -> np.ndarray:
-    """The same angle in [−π, π)."""
-    return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -96,7 +96,11 @@ class EpisodeMetrics:
 
     def first(self, episodes: int) -> EpisodeMetrics:
         """The first episodes alone."""
-        return EpisodeMetrics(**{name: getattr(self, name)[:episodes] for name in FIELDS})
+        return self.part(slice(episodes))
+
+    def part(self, episodes: slice) -> EpisodeMetrics:
+        """Some of the episodes; views, not copies."""
+        return EpisodeMetrics(**{name: getattr(self, name)[episodes] for name in FIELDS})
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Name -> array."""
@@ -143,8 +147,15 @@ class Result:
         first = runs[0]
         if len(runs) == 1:
             return first
+        pooled = EpisodeMetrics.concatenate([run.metrics for run in runs])
+        ends = np.cumsum([0, *(len(run.metrics) for run in runs)])
+        # Each run's arrays become views of the pooled ones: nothing is held twice.
+        runs = [
+            dataclasses.replace(run, metrics=pooled.part(slice(ends[i], ends[i + 1])))
+            for i, run in enumerate(runs)
+        ]
         return cls(
-            metrics=EpisodeMetrics.concatenate([run.metrics for run in runs]),
+            metrics=pooled,
             seed=first.seed,
             substeps=first.substeps,
             closed_loop=first.closed_loop,
