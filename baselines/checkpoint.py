@@ -1,6 +1,6 @@
 """A training run on disk: what it is, and where it stands.
 
-run.json                 scenario, configuration, seed, versions: written once
+run.json                 scenario or family, configuration, seed, versions: written once
 checkpoint.safetensors   network parameters, Adam's moments, the best actor so far;
                          counters and its score in the header, so that one rename of one
                          file moves the run from one consistent state to the next
@@ -22,9 +22,11 @@ import safetensors.numpy
 
 from slipcar.baselines.config import PPOConfig
 from slipcar.baselines.files import write_atomically
-from slipcar.envs import Scenario
+from slipcar.baselines.policy import Policy
+from slipcar.baselines.storage import describe_source
+from slipcar.envs.sources import Source
 
-FORMAT = 1
+FORMAT = 2
 _RUN, _CHECKPOINT, _HEADER = "run.json", "checkpoint.safetensors", "slipcar"
 _PACKAGES = ("slipcar", "numpy", "gymnasium", "torch", "stable-baselines3", "safetensors")
 
@@ -39,6 +41,8 @@ class Checkpoint:
         state: what the next iteration starts from; `learner.get_state`.
         best: the actor with the lowest validation cost so far, as tensors; may be empty.
         best_record: when it stood and what it scored, as plain data.
+        history: the validation scores so far; see `training.Session`.
+        cpu_seconds: of this process's processor time so far, all sessions together.
     """
 
     iteration: int
@@ -46,6 +50,8 @@ class Checkpoint:
     state: dict[str, np.ndarray]
     best: dict[str, np.ndarray]
     best_record: dict[str, Any]
+    history: list[dict[str, Any]]
+    cpu_seconds: float
 
 
 def versions() -> dict[str, str]:
@@ -57,13 +63,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-def describe_run(scenario: Scenario, config: PPOConfig, seed: int) -> dict[str, Any]:
+def describe_run(
+    source: Source, config: PPOConfig, seed: int, initial: Policy | None = None
+) -> dict[str, Any]:
     """What a run is, as plain data: equal descriptions give equal weights."""
     return {
         "format": FORMAT,
-        "scenario": scenario.to_dict(),
+        **describe_source(source),
         "config": config.to_dict(),
         "seed": seed,
+        "initial": None if initial is None else initial.fingerprint(),
     }
 
 
@@ -83,6 +92,8 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
         "iteration": checkpoint.iteration,
         "seconds": checkpoint.seconds,
         "best": checkpoint.best_record,
+        "history": checkpoint.history,
+        "cpu_seconds": checkpoint.cpu_seconds,
     }
     content = safetensors.numpy.save(tensors, metadata={_HEADER: json.dumps(header)})
     write_atomically(folder / _CHECKPOINT, content)
@@ -128,6 +139,8 @@ def _read(path: Path) -> Checkpoint:
             state={k: v for k, v in tensors.items() if not k.startswith("best.")},
             best={k.removeprefix("best."): v for k, v in tensors.items() if k.startswith("best.")},
             best_record=dict(header["best"]),
+            history=list(header["history"]),
+            cpu_seconds=float(header["cpu_seconds"]),
         )
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ValueError(

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
+
+from slipcar.envs import Family
+from slipcar.envs.observation import Layout
+from slipcar.envs.sources import Source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +40,11 @@ class PPOConfig:
         validation_episodes: episodes of one evaluation; their noise is always the same.
         checkpoint_every: iterations between checkpoints.
         device: where torch computes; a network this small is slower on a GPU.
+        observation: what the policy sees: `features`, `egocentric` or `state`.
+        obstacle_slots: how many obstacles it sees; None shows all that a family's worlds may have,
+            and none of a single scenario's, which are always the same.
+        goal_share: share of the goal weight that training begins with, in (0, 1]; it rises to 1
+            over the first half of training (:mod:`slipcar.baselines.easing`).
 
     Raises:
         ValueError: naming the field, the bad value and what is allowed.
@@ -59,6 +69,9 @@ class PPOConfig:
     validation_episodes: int = 4096
     checkpoint_every: int = 10
     device: str = "cpu"
+    observation: str = "features"
+    obstacle_slots: int | None = None
+    goal_share: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
@@ -67,22 +80,28 @@ class PPOConfig:
             "validation_episodes", "checkpoint_every",
         )  # fmt: skip
         for name in counts:
-            _check(name, getattr(self, name), _is_count, "an integer >= 1")
+            check_number(name, getattr(self, name), is_count, "an integer >= 1")
         for name in ("learning_rate", "max_gradient_norm", "adam_epsilon", "reward_scale"):
-            _check(name, getattr(self, name), lambda x: x > 0.0, "finite and > 0")
+            check_number(name, getattr(self, name), lambda x: x > 0.0, "finite and > 0")
         for name in ("entropy_weight", "value_weight"):
-            _check(name, getattr(self, name), lambda x: x >= 0.0, "finite and >= 0")
-        _check("gamma", self.gamma, lambda x: 0.0 < x <= 1.0, "in (0, 1]")
-        _check("gae_lambda", self.gae_lambda, lambda x: 0.0 <= x <= 1.0, "in [0, 1]")
-        _check("clip_range", self.clip_range, lambda x: 0.0 < x < 1.0, "in (0, 1)")
-        _check("log_std_init", self.log_std_init, lambda x: -10.0 <= x <= 2.0, "in [-10, 2]")
-        for i, width in enumerate(self.hidden):
-            _check(f"hidden[{i}]", width, _is_count, "an integer >= 1")
+            check_number(name, getattr(self, name), lambda x: x >= 0.0, "finite and >= 0")
+        check_number("goal_share", self.goal_share, lambda x: 0.0 < x <= 1.0, "in (0, 1]")
+        check_number("gamma", self.gamma, lambda x: 0.0 < x <= 1.0, "in (0, 1]")
+        check_number("gae_lambda", self.gae_lambda, lambda x: 0.0 <= x <= 1.0, "in [0, 1]")
+        check_number("clip_range", self.clip_range, lambda x: 0.0 < x < 1.0, "in (0, 1)")
+        check_number("log_std_init", self.log_std_init, lambda x: -10.0 <= x <= 2.0, "in [-10, 2]")
+        check_widths(self.hidden)
+        Layout(self.observation, self.obstacle_slots or 0)
         if self.environments % self.minibatches:
             raise ValueError(
                 f"minibatches must divide environments = {self.environments}, "
                 f"not {self.minibatches}"
             )
+
+    @classmethod
+    def suited_to(cls, source: Source) -> PPOConfig:
+        """What was measured to work: the defaults for one scenario, another choice for a family."""
+        return cls(**FAMILY) if isinstance(source, Family) else cls()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -93,11 +112,31 @@ class PPOConfig:
         return -(-self.total_steps // (self.environments * steps_per_episode))
 
 
-def _is_count(value: Any) -> bool:
+#: What learning a family takes beside the defaults: other worlds every episode, seen from the car.
+FAMILY: dict[str, Any] = {
+    "total_steps": 4_000_000,
+    "environments": 512,
+    "goal_share": 0.03,
+    "hidden": (128, 128),
+    "observation": "egocentric",
+    "evaluate_every": 10,
+    "validation_episodes": 2048,
+}
+
+
+def is_count(value: Any) -> bool:
+    """Whether it is an integer, at least 1."""
     return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
-def _check(name: str, value: Any, good: Any, allowed: str) -> None:
+def check_widths(hidden: tuple[int, ...]) -> None:
+    """Raises ValueError unless all are integers, at least 1."""
+    for i, width in enumerate(hidden):
+        check_number(f"hidden[{i}]", width, is_count, "an integer >= 1")
+
+
+def check_number(name: str, value: Any, good: Callable[[Any], bool], allowed: str) -> None:
+    """Raises ValueError, naming the field, unless it is a finite number that is good."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and good(value)):
         raise ValueError(f"{name} must be {allowed}, not {value!r}")

@@ -7,9 +7,7 @@ is carried from one iteration to the next. That is why a run can be continued fr
 
 from __future__ import annotations
 
-import contextlib
-import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,9 +17,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
 
 from slipcar.baselines.config import PPOConfig
+from slipcar.baselines.easing import eased
 from slipcar.baselines.policy import Policy
 from slipcar.baselines.sb3 import SB3VecEnv
-from slipcar.envs import Scenario, SlipCarVectorEnv
+from slipcar.envs import SlipCarVectorEnv
+from slipcar.envs.observation import Layout
+from slipcar.envs.sources import Source, base_of
 
 
 class Learner(PPO):
@@ -29,10 +30,14 @@ class Learner(PPO):
 
     Attributes:
         iteration: how many are done.
+        layout: of the observations.
+        source_of: what an iteration trains on, by its number; None if always the same.
         after_iteration: called without arguments when a rollout and its updates are done.
     """
 
     iteration: int = 0
+    layout: Layout
+    source_of: Callable[[int], Source] | None = None
     after_iteration: Callable[[], None] = staticmethod(lambda: None)
 
     def collect_rollouts(self, env: Any, *args: Any, **kwargs: Any) -> bool:
@@ -44,6 +49,8 @@ class Learner(PPO):
         np.random.seed(for_numpy)  # noqa: NPY002
         torch.manual_seed(int(for_torch))
         env.seed(int(for_env))
+        if self.source_of is not None:
+            env.set_options({"scenario": self.source_of(self.iteration)})
         self._last_obs = env.reset()
         self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         return super().collect_rollouts(env, *args, **kwargs)
@@ -55,10 +62,16 @@ class Learner(PPO):
         self.after_iteration()
 
 
-def make_learner(scenario: Scenario, config: PPOConfig, seed: int) -> Learner:
+def make_learner(source: Source, config: PPOConfig, seed: int) -> Learner:
     """An untrained learner; equal arguments give equal weights."""
-    steps = scenario.nodes - 1
-    env = SlipCarVectorEnv(config.environments, scenario, autoreset_mode=AutoresetMode.SAME_STEP)
+    steps = base_of(source).nodes - 1
+    env = SlipCarVectorEnv(
+        config.environments,
+        source,
+        config.observation,
+        config.obstacle_slots,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
     learner = Learner(
         "MlpPolicy",
         SB3VecEnv(env, config.reward_scale),
@@ -82,6 +95,10 @@ def make_learner(scenario: Scenario, config: PPOConfig, seed: int) -> Learner:
         seed=seed,
         device=config.device,
     )
+    learner.layout = env.layout
+    if config.goal_share < 1.0:
+        iterations = config.iterations(steps)
+        learner.source_of = lambda i: eased(source, config.goal_share, i, iterations)
     learner.set_logger(Logger(folder=None, output_formats=[]))
     return learner
 
@@ -91,7 +108,7 @@ def log_to(learner: Learner, folder: str) -> None:
     learner.set_logger(configure(folder, ["tensorboard"]))
 
 
-def actor(learner: Learner, scenario: Scenario) -> Policy:
+def actor(learner: Learner, source: Source) -> Policy:
     """A copy of the learner's actor as it stands."""
     network = [*learner.policy.mlp_extractor.policy_net, learner.policy.action_net]
     layers = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
@@ -99,7 +116,9 @@ def actor(learner: Learner, scenario: Scenario) -> Policy:
         weights=tuple(_array(layer.weight) for layer in layers),
         biases=tuple(_array(layer.bias) for layer in layers),
         log_std=_array(learner.policy.log_std),
-        scenario=scenario,
+        trained_on=source,
+        observation=learner.layout.kind,
+        obstacle_slots=learner.layout.slots,
     )
 
 
@@ -142,24 +161,6 @@ def set_state(learner: Learner, state: Mapping[str, np.ndarray], iteration: int)
     learner.iteration = iteration
     learner.num_timesteps = iteration * learner.n_envs * learner.n_steps
     learner._n_updates = iteration * learner.n_epochs
-
-
-@contextlib.contextmanager
-def single_thread() -> Iterator[None]:
-    """One torch thread, since more slow so small a network down; put back afterwards.
-
-    So are the global random states of Python, NumPy and torch, which training seeds.
-    """
-    threads = torch.get_num_threads()
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -2,8 +2,9 @@
 
     a = clip(W_L φ(… φ(W_1 o + b_1) …) + b_L, −1, 1),      φ = ReLU
 
-o is the `features` observation (:mod:`slipcar.envs.observation`). This is the mean of the
-Gaussian that PPO trains (SPEC §6); sampling it needs `log_std` as well.
+o is an observation of :mod:`slipcar.envs.observation`: `features` on one scenario; with the nearest
+obstacles in the slots behind it for worlds that vary. This is the mean of the Gaussian that PPO
+trains (SPEC §6); sampling it needs `log_std` as well.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slipcar.envs import Scenario
-from slipcar.envs.observation import LAYOUTS
+from slipcar.envs import Family, Scenario
+from slipcar.envs.observation import Layout
+from slipcar.envs.sources import Source
 
 ACTION_DIM = 2
-OBSERVATION_DIM = len(LAYOUTS["features"])
 
 #: Rows given to one matrix product. BLAS rounds differently for different shapes, so a fixed
 #: one makes the action for an observation independent of the batch it comes in, to the bit.
@@ -33,25 +34,30 @@ class Policy:
     """The actor of a trained policy; `predict` has Stable-Baselines3's signature.
 
     Attributes:
-        weights: one matrix a layer, (out, in) float32; the first takes the 12 features, the
-            last gives the 2 actions.
+        weights: one matrix a layer, (out, in) float32; the first takes an observation, the last
+            gives the 2 actions.
         biases: one vector a layer, (out,) float32.
         log_std: logarithm of the exploration noise of each action, (2,) float32.
-        scenario: the one it was trained on.
-        training: how it was trained, as plain data: configuration, seed, seconds, versions.
+        trained_on: a scenario, or a family of them.
+        training: how it was trained, as plain data: configuration, seed, seconds, versions, and
+            `history`, the validation scores on the way.
+        observation: which kind it must be given: `features`, `egocentric` or `state`.
+        obstacle_slots: how many obstacles the observation must show.
 
     Raises:
-        ValueError: for layers that do not fit together or non-finite numbers.
+        ValueError: for layers that do not fit together or the observation, non-finite numbers, or
+            an unknown kind of observation.
     """
 
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
     log_std: np.ndarray
-    scenario: Scenario
+    trained_on: Source
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    observation: str = "features"
+    obstacle_slots: int = 0
 
-    #: Which observation it must be given, and that it uses it.
-    observation: ClassVar[str] = "features"
+    #: That it looks at the state.
     closed_loop: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -60,7 +66,9 @@ class Policy:
                 f"a policy needs as many weight matrices as biases and at least one, "
                 f"not {len(self.weights)} and {len(self.biases)}"
             )
-        width = OBSERVATION_DIM
+        if not isinstance(self.trained_on, (Scenario, Family)):
+            raise ValueError(f"trained_on must be a Scenario or a Family, not {self.trained_on!r}")
+        width = self.layout.size
         checked: dict[str, list[np.ndarray]] = {"weights": [], "biases": []}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             rows = len(weight) if np.ndim(weight) else 0
@@ -73,9 +81,47 @@ class Policy:
         object.__setattr__(self, "log_std", _parameter("log_std", self.log_std, (ACTION_DIM,)))
 
     @property
+    def layout(self) -> Layout:
+        """What an observation consists of."""
+        return Layout(self.observation, self.obstacle_slots)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario it was trained on.
+
+        Raises:
+            ValueError: if that is a family: `trained_on` tells which.
+        """
+        if isinstance(self.trained_on, Family):
+            raise ValueError(
+                "this policy was trained on a family of worlds, not on one scenario: name the "
+                "world that it is to drive in, such as family:random:0"
+            )
+        return self.trained_on
+
+    def knows(self, scenario: Scenario) -> bool:
+        """Whether it was trained on this scenario, or on a family that it may come from.
+
+        That is: everything that all worlds of the family share is the same, and the number of
+        obstacles, the slip and the horizon lie within its ranges. Where things lie is not asked.
+        """
+        family = self.trained_on
+        if not isinstance(family, Family):
+            return family == scenario
+        varied = ("start", "goal", "horizon", "slip", "obstacles")
+        common = scenario.replace(**{name: getattr(family.base, name) for name in varied})
+        numbers = (
+            (family.obstacles, len(scenario.obstacles)),
+            (family.slip, scenario.slip[0]),
+            (family.horizon, scenario.horizon),
+        )
+        within = all(ends[0] <= number <= ends[1] for ends, number in numbers)
+        return bool(common == family.base and within)
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """Widths from the observation to the action, such as (12, 64, 64, 2)."""
-        return (OBSERVATION_DIM, *(len(bias) for bias in self.biases))
+        return (self.layout.size, *(len(bias) for bias in self.biases))
 
     @property
     def preparation_time(self) -> float:
@@ -84,7 +130,7 @@ class Policy:
 
     def fingerprint(self) -> str:
         """Hexadecimal digest of everything the actions depend on."""
-        digest = hashlib.sha256(repr((LAYOUTS[self.observation], self.sizes)).encode())
+        digest = hashlib.sha256(repr((self.layout.entries, self.sizes)).encode())
         for array in (*self.weights, *self.biases, self.log_std):
             digest.update(np.ascontiguousarray(array, dtype="<f4").tobytes())
         return digest.hexdigest()[:16]
@@ -104,7 +150,7 @@ class Policy:
         """Mean action before clipping, float64.
 
         Args:
-            observation: features, (..., 12), finite.
+            observation: (..., d), finite; d = 12 for `features` without slots.
 
         Returns:
             (..., 2); each row depends on its own observation alone, to the last bit.
@@ -112,12 +158,13 @@ class Policy:
         Raises:
             ValueError: for another length of the last axis or a non-finite entry.
         """
-        observed = _checked_observation(observation)
+        size = self.sizes[0]
+        observed = _checked_observation(observation, self.layout)
         batch = observed.shape[:-1]
-        rows = observed.reshape(-1, OBSERVATION_DIM)
-        padded = np.zeros((-(-len(rows) // _ROWS) * _ROWS, OBSERVATION_DIM))
+        rows = observed.reshape(-1, size)
+        padded = np.zeros((-(-len(rows) // _ROWS) * _ROWS, size))
         padded[: len(rows)] = rows
-        hidden = padded.reshape(-1, _ROWS, OBSERVATION_DIM)
+        hidden = padded.reshape(-1, _ROWS, size)
         *inner, (weight, bias) = self._layers
         for W, b in inner:
             hidden = hidden @ W
@@ -136,7 +183,7 @@ class Policy:
         """Action for one observation or a batch.
 
         Args:
-            observation: features, (12,) or (..., 12), finite.
+            observation: (d,) or (..., d), finite; d = 12 for `features` without slots.
             state: returned as it is: the policy has no memory.
             episode_start: ignored, for the same reason.
             deterministic: whether to return the mean; otherwise a sample around it, from a
@@ -164,17 +211,18 @@ def _parameter(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarra
     return array
 
 
-def _checked_observation(observation: ArrayLike) -> np.ndarray:
+def _checked_observation(observation: ArrayLike, layout: Layout) -> np.ndarray:
+    size, shown = layout.size, f" showing {layout.slots} obstacles" if layout.slots else ""
     try:
         observed = np.asarray(observation, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"an observation must be an array of {OBSERVATION_DIM} features, "
+            f"an observation must be an array of {size} {layout.kind}{shown}, "
             f"not {type(observation).__name__}"
         ) from error
-    if observed.ndim == 0 or observed.shape[-1] != OBSERVATION_DIM:
+    if observed.ndim == 0 or observed.shape[-1] != size:
         raise ValueError(
-            f"this policy needs 'features' observations, {OBSERVATION_DIM} entries on the last "
+            f"this policy needs {layout.kind!r} observations{shown}, {size} entries on the last "
             f"axis, not shape {observed.shape}"
         )
     if not np.isfinite(observed).all():

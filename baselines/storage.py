@@ -1,19 +1,18 @@
 """Policies on disk: weights as safetensors, everything else as JSON beside them.
 
     <stem>.safetensors   layer.<i>.weight (out, in), layer.<i>.bias (out,), log_std (2,)
-    <stem>.json          format, architecture, observation and action layout, scenario,
-                         training (configuration, seed, versions, seconds), fingerprint
+    <stem>.json          format, architecture, observation and action layout, the scenario or
+                         family it was trained on, training (configuration, seed, versions,
+                         seconds, history), fingerprint
 
 Nothing here can run code: safetensors holds numbers alone, and no pickle is ever read.
 """
 
 from __future__ import annotations
 
-import importlib.resources
 import itertools
 import json
 from collections.abc import Mapping
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,13 @@ import safetensors
 import safetensors.numpy
 
 from slipcar.baselines.files import write_atomically
-from slipcar.baselines.policy import ACTION_DIM, OBSERVATION_DIM, Policy
-from slipcar.envs import Scenario
-from slipcar.envs.observation import describe
+from slipcar.baselines.policy import ACTION_DIM, Policy
+from slipcar.baselines.shipped import DEFAULT, SUFFIXES, File, shipped_file, shipped_seeds
+from slipcar.envs import Family, Scenario
+from slipcar.envs.observation import KINDS, LAYOUTS, SLOT, Layout, describe
+from slipcar.envs.sources import Source
 
 FORMAT = 1
-SHIPPED = "paper"
 _ACTION = {
     "entries": ["a_v / bound", "a_omega / bound"],
     "range": [-1.0, 1.0],
@@ -57,8 +57,8 @@ def load_policy(path: str | Path | None = None) -> Policy:
     """Read a policy.
 
     Args:
-        path: as for :func:`save_policy`; None reads the policy shipped with slipcar, trained
-            on the paper's scenario.
+        path: as for :func:`save_policy`; None reads the policy shipped with slipcar, PPO of seed 0
+            on the paper's scenario. :func:`shipped_runs` has the others.
 
     Raises:
         FileNotFoundError: if one of the two files is missing.
@@ -66,14 +66,29 @@ def load_policy(path: str | Path | None = None) -> Policy:
             if a tensor is missing, misshapen or not finite, or if the two do not belong
             together; the message names the file and what is wrong.
     """
-    weights: Path | Traversable
-    description: Path | Traversable
     if path is None:
-        folder = importlib.resources.files("slipcar.baselines") / "weights"
-        weights, description = folder / f"{SHIPPED}.safetensors", folder / f"{SHIPPED}.json"
-    else:
-        stem = _stem(Path(path))
-        weights, description = _beside(stem, ".safetensors"), _beside(stem, ".json")
+        return _read(*(shipped_file(*DEFAULT, suffix) for suffix in SUFFIXES))
+    stem = _stem(Path(path))
+    return _read(*(_beside(stem, suffix) for suffix in SUFFIXES))
+
+
+def shipped_runs(method: str = "ppo", world: str = "paper") -> tuple[Policy, ...]:
+    """The policies shipped of one method: one training for each seed, seed 0 first.
+
+    Args:
+        method: how they were trained; :func:`shipped_methods` lists them.
+        world: what they were trained on: `paper`, or `random` (the family of that name).
+
+    Raises:
+        ValueError: for a method or a world of which none are shipped, listing those that are.
+    """
+    return tuple(
+        _read(*(shipped_file(world, method, seed, suffix) for suffix in SUFFIXES))
+        for seed in shipped_seeds(method, world)
+    )
+
+
+def _read(weights: File, description: File) -> Policy:
     for file, what in ((weights, "weights"), (description, "description")):
         if not file.is_file():
             raise FileNotFoundError(
@@ -83,12 +98,12 @@ def load_policy(path: str | Path | None = None) -> Policy:
         data = _read_description(description.read_bytes())
     except ValueError as error:
         raise ValueError(f"{description}: {error}") from error
+    layout = _read_layout(data["observation"])
     try:
         tensors = _read_tensors(weights.read_bytes(), data["architecture"]["sizes"])
     except ValueError as error:
         raise ValueError(f"{weights}: {error}") from error
-    scenario = Scenario.from_json(json.dumps(data["scenario"]))
-    policy = policy_from_tensors(tensors, scenario, data["training"])
+    policy = policy_from_tensors(tensors, _read_source(data), layout, data["training"])
     if policy.fingerprint() != data["fingerprint"]:
         raise ValueError(
             f"{weights} has fingerprint {policy.fingerprint()} but {description} describes "
@@ -118,10 +133,17 @@ def policy_tensors(policy: Policy) -> dict[str, np.ndarray]:
 
 def policy_from_tensors(
     tensors: Mapping[str, np.ndarray],
-    scenario: Scenario,
+    trained_on: Source,
+    layout: Layout,
     training: Mapping[str, Any] | None = None,
 ) -> Policy:
     """The inverse of :func:`policy_tensors`.
+
+    Args:
+        tensors: by the names they have on disk.
+        trained_on: a scenario or a family.
+        layout: of the observations.
+        training: how it was trained.
 
     Raises:
         ValueError: for missing, misshapen or non-finite tensors.
@@ -135,8 +157,10 @@ def policy_from_tensors(
         weights=tuple(tensors[f"layer.{i}.weight"] for i in layers),
         biases=tuple(tensors[f"layer.{i}.bias"] for i in layers),
         log_std=tensors["log_std"],
-        scenario=scenario,
+        trained_on=trained_on,
         training=training or {},
+        observation=layout.kind,
+        obstacle_slots=layout.slots,
     )
 
 
@@ -145,11 +169,44 @@ def _description(policy: Policy) -> dict[str, Any]:
         "format": FORMAT,
         "fingerprint": policy.fingerprint(),
         "architecture": {"sizes": list(policy.sizes), "activation": _ACTIVATION},
-        "observation": describe(policy.observation),
+        "observation": describe(policy.observation, policy.obstacle_slots),
         "action": _ACTION,
-        "scenario": policy.scenario.to_dict(),
+        **describe_source(policy.trained_on),
         "training": dict(policy.training),
     }
+
+
+def describe_source(source: Source) -> dict[str, Any]:
+    """A scenario or a family as plain data under its own key."""
+    key = "family" if isinstance(source, Family) else "scenario"
+    return {key: source.to_dict()}
+
+
+def _read_source(data: Mapping[str, Any]) -> Source:
+    if "family" in data:
+        return Family.from_dict(data["family"])
+    return Scenario.from_json(json.dumps(data["scenario"]))
+
+
+def _read_layout(described: Mapping[str, Any]) -> Layout:
+    """The layout that this is the description of.
+
+    Raises:
+        ValueError: if this version has none such.
+    """
+    kind, entries = described.get("kind"), described.get("entries")
+    if kind not in KINDS or not isinstance(entries, list):
+        raise ValueError(
+            f"the policy was trained with another observation layout: {dict(described)}; "
+            f"this version has {list(KINDS)}"
+        )
+    slots = max(0, len(entries) - len(LAYOUTS[kind])) // len(SLOT)
+    if described != describe(kind, slots):
+        raise ValueError(
+            f"the policy was trained with another observation layout: {dict(described)}; "
+            f"this version has {describe(kind, slots)}"
+        )
+    return Layout(kind, slots)
 
 
 def _read_description(content: bytes) -> dict[str, Any]:
@@ -165,17 +222,17 @@ def _read_description(content: bytes) -> dict[str, Any]:
         )
     expected = {
         "fingerprint": str, "architecture": dict, "observation": dict, "action": dict,
-        "scenario": dict, "training": dict,
+        "family" if "family" in data else "scenario": dict, "training": dict,
     }  # fmt: skip
     for name, kind in expected.items():
         if not isinstance(data.get(name), kind):
             raise ValueError(f"{name!r} is missing or is not a {kind.__name__}")
-    for name, ours in (("observation", describe(Policy.observation)), ("action", _ACTION)):
-        if data[name] != ours:
-            raise ValueError(
-                f"the policy was trained with another {name} layout: {data[name]}; "
-                f"this version has {ours}"
-            )
+    if data["action"] != _ACTION:
+        raise ValueError(
+            f"the policy was trained with another action layout: {data['action']}; "
+            f"this version has {_ACTION}"
+        )
+    size = _read_layout(data["observation"]).size
     activation = data["architecture"].get("activation")
     if activation != _ACTIVATION:
         raise ValueError(f"unknown activation {activation!r}; known is {_ACTIVATION!r}")
@@ -184,13 +241,13 @@ def _read_description(content: bytes) -> dict[str, Any]:
         not isinstance(sizes, list)
         or len(sizes) < 2
         or not all(type(n) is int and n > 0 for n in sizes)
-        or (sizes[0], sizes[-1]) != (OBSERVATION_DIM, ACTION_DIM)
+        or (sizes[0], sizes[-1]) != (size, ACTION_DIM)
     ):
         raise ValueError(
-            f"architecture sizes must be positive integers from {OBSERVATION_DIM} observations "
+            f"architecture sizes must be positive integers from {size} observations "
             f"to {ACTION_DIM} actions, not {sizes}"
         )
-    Scenario.from_json(json.dumps(data["scenario"]))
+    _read_source(data)
     return data
 
 

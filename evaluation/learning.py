@@ -33,7 +33,7 @@ class Curve:
     Attributes:
         label: of the training, such as "seed 0".
         steps: environment steps done.
-        seconds: of training.
+        seconds: of training, of the processor as far as that is known.
         total: mean cost of a path.
         collision_rate: share of episodes.
     """
@@ -69,7 +69,9 @@ def curves(rows: Mapping[str, Any]) -> dict[str, list[Curve]]:
 
 
 def _curve(label: str, history: list[dict[str, float]]) -> Curve:
-    columns = ("steps", "seconds", "total", "collision_rate")
+    # Of the processor, where they were kept: a busy machine makes no learner slower.
+    seconds = "cpu_seconds" if "cpu_seconds" in history[0] else "seconds"
+    columns = ("steps", seconds, "total", "collision_rate")
     return Curve(label, *(np.array([float(at[name]) for at in history]) for name in columns))
 
 

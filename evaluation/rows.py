@@ -93,10 +93,10 @@ def learned(
         methods: which of the shipped ones; None is all.
     """
     if policy is not None:
-        if getattr(policy, "scenario", scenario) != scenario:
+        if isinstance(policy, baselines.Policy) and not policy.knows(scenario):
             notes.append(f"{PPO}: the policy was trained on another scenario.")
         return {PPO: policy}
-    if baselines.load_policy().scenario != scenario:
+    if not baselines.load_policy().knows(scenario):
         notes.append(
             f"No {PPO} row: the shipped policies were trained on another scenario. Train one with "
             "`slipcar train --scenario ...` and pass it with --policy."

@@ -281,14 +281,14 @@ def test_the_wheel_holds_the_package_and_nothing_else(shipped):
         f"slipcar/{path.relative_to(ROOT)}"
         for name in NAMES
         for path in (ROOT / name).rglob("*")
-        if path.suffix in kept or (path.parent.name == "weights" and path.is_file())
+        if path.suffix in kept or ("weights" in path.parts and path.is_file())
     }
     assert {name for name in shipped if ".dist-info/" not in name} == expected
 
 
 def test_the_wheel_carries_the_shipped_policy(shipped):
     weights = {Path(name).name for name in shipped if "/weights/" in name}
-    assert {"paper.json", "paper.safetensors"} <= weights
+    assert {"ppo-0.json", "ppo-0.safetensors"} <= weights
 
 
 def test_the_wheel_knows_its_licence_and_entry_points(shipped):

@@ -16,6 +16,7 @@ from slipcar.evaluation.makers import Maker
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from slipcar.baselines import Policy
     from slipcar.evaluation.controller import Controller
 
 _SCENARIO_HELP = (
@@ -118,7 +119,7 @@ def read_controller(
 
     if text == "ppo":
         policy = baselines.load_policy()
-        return policy, scenario or policy.scenario
+        return policy, scenario or _trained_on(policy)
     if text in MAKERS:
         world = scenario or Scenario.named("paper")
         return MAKERS[text](world), world
@@ -132,10 +133,16 @@ def read_controller(
         return (OpenLoop(stored) if stored.gains is None else Feedback(stored)), world
     if path.suffix in (".safetensors", ".json") or (path.is_dir() and ":" not in text):
         policy = baselines.load_policy(path)
-        return policy, scenario or policy.scenario
+        return policy, scenario or _trained_on(policy)
     world = scenario or Scenario.named("paper")
     with _words_are_known():
         return load_controller(text, world, trust=trust)[1], world
+
+
+def _trained_on(policy: Policy) -> Scenario:
+    """The scenario of a policy; of one that knows a family, the first world of that."""
+    known = policy.trained_on
+    return known.sample(0) if isinstance(known, Family) else known
 
 
 def read_maker(text: str, trust: bool = False) -> tuple[str, Callable[[Scenario], Controller]]:

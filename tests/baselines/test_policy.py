@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slipcar.baselines import Policy, PPOConfig
-from slipcar.envs import Scenario
+from slipcar.envs import Family, Scenario
 
 PAPER = Scenario.named("paper")
 
@@ -19,7 +19,7 @@ def make(seed=0, sizes=(12, 16, 8, 2), scale=0.4, **changes):
         "weights": tuple(scale * rng.standard_normal((m, n)) for n, m in itertools.pairwise(sizes)),
         "biases": tuple(0.1 * rng.standard_normal(m) for m in sizes[1:]),
         "log_std": np.full(2, -1.0),
-        "scenario": PAPER,
+        "trained_on": PAPER,
     }
     return Policy(**{**fields, **changes})
 
@@ -101,6 +101,23 @@ def test_what_an_evaluator_asks_for():
     changed[0] = np.nextafter(changed[0], np.float32(1.0), dtype=np.float32)
     biases = (policy.biases[0], changed, policy.biases[2])
     assert make(biases=biases).fingerprint() != policy.fingerprint()
+
+
+def test_it_knows_what_it_was_trained_on():
+    assert make().knows(PAPER)
+    assert not make().knows(PAPER.replace(clearance=0.2))
+    family = Family.named("random")
+    wide = make(trained_on=family)
+    world = family.sample(3)
+    assert wide.knows(world)
+    assert wide.knows(PAPER)  # one that the family might have drawn
+    for other in (
+        world.replace(slip=(0.3, 0.03)),
+        world.replace(nodes=21),
+        world.replace(goal_weight=10.0),
+        Family.named("crowded").sample(0),
+    ):
+        assert not wide.knows(other)
 
 
 def test_is_read_only():

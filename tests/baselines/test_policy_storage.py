@@ -10,7 +10,8 @@ import pytest
 import safetensors.numpy
 
 from slipcar.baselines import Policy, load_policy, save_policy
-from slipcar.envs import Scenario
+from slipcar.envs import Family, Scenario
+from slipcar.envs.observation import Layout
 
 SCENARIO = Scenario.random(seed=4, obstacles=3)
 
@@ -21,7 +22,7 @@ def make(seed=0, width=5):
         weights=(rng.standard_normal((width, 12)), rng.standard_normal((2, width))),
         biases=(rng.standard_normal(width), rng.standard_normal(2)),
         log_std=rng.standard_normal(2),
-        scenario=SCENARIO,
+        trained_on=SCENARIO,
         training={"seconds": 3.5, "config": {"gamma": 1.0}, "seed": seed},
     )
 
@@ -53,10 +54,44 @@ def test_round_trip_is_exact(stem):
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
-    assert loaded.scenario == SCENARIO
+    assert loaded.scenario == loaded.trained_on == SCENARIO
     assert loaded.training == policy.training
     assert loaded.preparation_time == 3.5
     assert loaded.fingerprint() == policy.fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "kind", "slots"),
+    [
+        (SCENARIO, "features", 3),
+        (SCENARIO, "state", 0),
+        (Family.named("slippery"), "egocentric", 8),
+        (Family.named("easy"), "egocentric", 0),
+    ],
+)
+def test_other_observations_and_families_round_trip(tmp_path, trained_on, kind, slots):
+    size, rng = Layout(kind, slots).size, np.random.default_rng(2)
+    policy = Policy(
+        weights=(rng.standard_normal((2, size)),),
+        biases=(np.zeros(2),),
+        log_std=np.zeros(2),
+        trained_on=trained_on,
+        observation=kind,
+        obstacle_slots=slots,
+    )
+    loaded = load_policy(save_policy(policy, tmp_path / "a"))
+    assert loaded.fingerprint() == policy.fingerprint()
+    assert (loaded.trained_on, loaded.layout) == (trained_on, policy.layout)
+    observation = rng.standard_normal((5, size))
+    np.testing.assert_array_equal(loaded.mean(observation), policy.mean(observation))
+
+
+def test_a_family_has_no_single_scenario():
+    policy = Policy((np.zeros((2, 12)),), (np.zeros(2),), np.zeros(2), Family.named("easy"))
+    with pytest.raises(ValueError, match="trained on a family of worlds"):
+        policy.scenario  # noqa: B018
+    with pytest.raises(ValueError, match="a Scenario or a Family, not 'paper'"):
+        Policy((np.zeros((2, 12)),), (np.zeros(2),), np.zeros(2), "paper")
 
 
 def test_the_ways_to_name_it(tmp_path):

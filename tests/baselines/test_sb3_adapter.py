@@ -35,7 +35,7 @@ def random_policy(seed=0):
         weights=(0.3 * rng.standard_normal((8, 12)), 0.3 * rng.standard_normal((2, 8))),
         biases=(np.zeros(8), np.zeros(2)),
         log_std=np.zeros(2),
-        scenario=PAPER,
+        trained_on=PAPER,
     )
 
 

@@ -14,8 +14,10 @@ import torch
 
 from slipcar.baselines import PPOConfig, load_policy, score, train_ppo
 from slipcar.baselines.files import write_atomically
-from slipcar.baselines.learner import make_learner, single_thread
-from slipcar.envs import Scenario
+from slipcar.baselines.learner import make_learner
+from slipcar.baselines.session import single_thread
+from slipcar.baselines.validation import validation_worlds
+from slipcar.envs import Family, Scenario
 
 PAPER = Scenario.named("paper")
 COARSE = PAPER.replace(nodes=11)  # ten steps an episode
@@ -54,6 +56,13 @@ def same(a, b):
     return all(np.array_equal(x, y) for x, y in arrays)
 
 
+def untimed(record):
+    """A training record without what differs from run to run: seconds."""
+    if isinstance(record, dict):
+        return {k: untimed(v) for k, v in record.items() if not k.endswith("seconds")}
+    return [untimed(v) for v in record] if isinstance(record, list) else record
+
+
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
@@ -71,8 +80,9 @@ def test_a_resumed_run_is_bit_identical(uninterrupted, tmp_path, cuts):
     for name in ("policy", "last"):
         assert same(load_policy(tmp_path / name), load_policy(uninterrupted / name))
     assert same(best, load_policy(tmp_path / "policy"))
-    record, whole = best.training, load_policy(uninterrupted).training
-    assert {**record, "seconds": 0} == {**whole, "seconds": 0}
+    record, whole = untimed(best.training), untimed(load_policy(uninterrupted).training)
+    assert record == whole
+    assert [entry["steps"] for entry in record["history"]] == [160 * i for i in range(1, 7)]
 
 
 def test_resuming_skips_what_is_done(tmp_path):
@@ -225,6 +235,45 @@ def test_other_scenarios_train_too(tmp_path):
     config = dataclasses.replace(TINY, total_steps=200)
     policy = train_ppo(world, config, folder=tmp_path, progress=False)
     assert policy.scenario == load_policy(tmp_path).scenario == world
+
+
+FAMILY = Family.named("easy").replace(base=Scenario.named("open").replace(nodes=11))
+FAMILIAR = dataclasses.replace(TINY, observation="egocentric", evaluate_every=3)
+
+
+@pytest.mark.parametrize("slots", [None, 0, 3])
+def test_a_family_is_learnt_repeatably_and_resumed_to_the_bit(tmp_path, slots):
+    config = dataclasses.replace(FAMILIAR, obstacle_slots=slots)
+    whole = train_ppo(FAMILY, config, progress=False)
+    with pytest.raises(PowerCutError):
+        train_ppo(FAMILY, config, folder=tmp_path, progress=False, callback=stop_at(7))
+    resumed = train_ppo(FAMILY, config, folder=tmp_path, progress=False)
+    assert same(whole, resumed)
+    assert untimed(whole.training) == untimed(resumed.training)
+    kept = load_policy(tmp_path)
+    assert (kept.trained_on, kept.observation) == (FAMILY, "egocentric")
+    assert kept.obstacle_slots == (2 if slots is None else slots)
+
+
+def test_a_family_is_validated_in_worlds_of_its_own():
+    worlds = validation_worlds(FAMILY, 50)
+    assert len(set(worlds)) == 50
+    assert not set(worlds) & set(FAMILY.held_out())
+    policy = train_ppo(FAMILY, FAMILIAR, progress=False)
+    found = score(policy, validation_worlds(FAMILY, 4), 4, policy.training["validation_seed"])
+    assert found.total == pytest.approx(policy.training["validation"]["total"], rel=1e-12)
+
+
+def test_another_family_in_the_folder_is_refused(tmp_path):
+    train_ppo(FAMILY, FAMILIAR, folder=tmp_path, progress=False)
+    other = FAMILY.replace(corridor=0.5)
+    with pytest.raises(ValueError, match=r"family.corridor is 1\.2, not 0\.5"):
+        train_ppo(other, FAMILIAR, folder=tmp_path, progress=False)
+
+
+def test_too_few_slots_are_refused_before_training():
+    with pytest.raises(ValueError, match="up to 2 obstacles and the observation shows 1"):
+        train_ppo(FAMILY, dataclasses.replace(FAMILIAR, obstacle_slots=1), progress=False)
 
 
 def test_every_rollout_is_one_whole_episode_in_every_environment():
