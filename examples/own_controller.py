@@ -62,8 +62,10 @@ if __name__ == "__main__":
     from slipcar.evaluation.own import as_controller
     from slipcar.planner import Feedback, plan
 
+    planned = plan(SCENARIO)
+    print(f"plan: {planned.status.name}")
     rows = {
-        "tracked SCP": Feedback(plan(SCENARIO)),
+        "tracked SCP": Feedback(planned),
         "drawn by hand": as_controller(controller, SCENARIO),
     }
     frame = compare(rows, SCENARIO, episodes=2000, progress=False).frame

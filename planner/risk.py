@@ -106,7 +106,9 @@ def check_risk(delta: Any) -> None:
         raise ValueError(f"risk must be a probability in (0, 1), e.g. 0.01 for 1 %, not {delta!r}")
 
 
-def wilson_interval(successes: float, trials: int, level: float = CONFIDENCE) -> tuple[float, float]:
+def wilson_interval(
+    successes: float, trials: int, level: float = CONFIDENCE
+) -> tuple[float, float]:
     """Wilson score interval of a proportion: the p with |k/n − p| ≤ z √(p (1 − p) / n).
 
     Unlike the normal interval it stays in [0, 1] and says something when nothing was observed.

@@ -276,7 +276,7 @@ def shipped(wheel):
 
 
 def test_the_wheel_holds_the_package_and_nothing_else(shipped):
-    kept = {".py", ".typed"}
+    kept = {".py", ".typed", ".html", ".css", ".js"}
     expected = {
         f"slipcar/{path.relative_to(ROOT)}"
         for name in NAMES

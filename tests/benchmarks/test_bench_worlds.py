@@ -148,5 +148,5 @@ def test_best_of_three_ignores_a_cheap_failure_and_counts_all_work(worlds):
 def test_figure_is_drawn(worlds, measured, tmp_path):
     pytest.importorskip("matplotlib")
     paths = worlds.draw(measured[0], tmp_path)
-    assert {path.suffix for path in paths} == {".png", ".pdf"}
+    assert {path.suffix for path in paths} == {".png", ".pdf", ".svg"}
     assert all(path.stat().st_size > 1000 for path in paths)

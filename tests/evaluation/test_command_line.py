@@ -207,10 +207,8 @@ def test_a_stored_plan_drives_the_scenario_it_was_made_for(tmp_path, monkeypatch
 
 
 def test_compare_end_to_end(tmp_path, capsys, monkeypatch, replay):
-    paper = Scenario.named("paper")
-    monkeypatch.setattr("slipcar.baselines.load_policy", lambda path=None: driver)
-    driver = replay(paper, (0.1, 0.0))
-    driver.scenario = paper
+    driver = replay(Scenario.named("paper"), (0.1, 0.0))
+    monkeypatch.setattr("slipcar.baselines.shipped_runs", lambda method, world: (driver,))
     arguments = ["compare", "--episodes", "200", "--folder", str(tmp_path), "--no-figures"]
     assert main(arguments) == 0
     text = capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.envs.observation import observe
-from slipcar.evaluation import rollout
+from slipcar.evaluation import evaluate
 from slipcar.planner import OpenLoop, Status, plan
 from slipcar.planner.receding_horizon import RecedingHorizon
 
@@ -134,8 +134,8 @@ def test_numpy_and_compiled_make_the_same_plans(paper, price):
 
 
 def test_replanning_beats_the_open_loop_on_the_same_paths(controller, paper):
-    ours = rollout(controller, paper, 256, seed=3)
-    open_loop = rollout(OpenLoop(plan(paper)), paper, 256, seed=3)
+    ours = evaluate(controller, paper, 256, seed=3)
+    open_loop = evaluate(OpenLoop(plan(paper)), paper, 256, seed=3)
     saved = open_loop.metrics.total - ours.metrics.total
     assert saved.mean() > 4.0 * saved.std() / 16.0
     assert ours.metrics.total.mean() < 5.3
@@ -145,7 +145,7 @@ def test_replanning_beats_the_open_loop_on_the_same_paths(controller, paper):
 def test_a_price_of_risk_keeps_margins(paper):
     clearance = []
     for price in (0.0, 100.0):
-        m = rollout(RecedingHorizon(paper, risk_price=price), paper, 128, seed=4).metrics
+        m = evaluate(RecedingHorizon(paper, risk_price=price), paper, 128, seed=4).metrics
         clearance.append(np.quantile(m.clearance, 0.05))
     assert clearance[1] > clearance[0] + 0.01
 
@@ -154,9 +154,9 @@ def test_a_price_of_risk_keeps_margins(paper):
 def test_random_worlds(seed):
     world = Scenario.random(seed)
     c = RecedingHorizon(world)
-    ours = rollout(c, world, 64, seed=1)
+    ours = evaluate(c, world, 64, seed=1)
     assert (c.status, ours.failures) == (Status.CONVERGED, 0)
-    open_loop = rollout(OpenLoop(plan(world)), world, 64, seed=1)
+    open_loop = evaluate(OpenLoop(plan(world)), world, 64, seed=1)
     assert ours.metrics.total.mean() < open_loop.metrics.total.mean()
 
 
@@ -304,9 +304,9 @@ class Forgetful:
 
 @pytest.mark.parametrize("batch_size", [None, 1024])
 def test_rollouts_hand_states_on_and_count_failures_of_the_episodes_asked_for(paper, batch_size):
-    done = rollout(Forgetful(), paper, 1500, batch_size=batch_size)
+    done = evaluate(Forgetful(), paper, 1500, batch_size=batch_size)
     assert done.failures == 1500 * 20
-    assert rollout(OpenLoop(plan(paper)), paper, 10).failures is None
+    assert evaluate(OpenLoop(plan(paper)), paper, 10).failures == 0
 
 
 # ------------------------------------------------------------------ bad input
