@@ -11,12 +11,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import inspect
 import io
 import json
-import pickle
 import platform
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +23,7 @@ from slipcar.baselines import Policy
 from slipcar.baselines.files import remove_leftovers, write_atomically
 from slipcar.evaluation.metrics import FIELDS, EpisodeMetrics
 from slipcar.evaluation.noise import BLOCK
+from slipcar.evaluation.own.digest import behaviour_digest
 from slipcar.evaluation.provenance import code_digest, versions
 from slipcar.evaluation.rollout import Measured, Stretch
 from slipcar.planner import Feedback, OpenLoop
@@ -34,7 +32,7 @@ FORMAT = 2
 _SCALARS = tuple(f.name for f in dataclasses.fields(Measured) if f.name != "metrics")
 #: Whose versions count, by the first two parts of the module that a controller comes from.
 _PLANNING = ("numpy", "scipy", "numba")
-_ANY = (*_PLANNING, "gymnasium", "torch", "stable-baselines3", "cvxpy", "osqp")
+_ANY = (*_PLANNING, "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "cvxpy", "osqp")
 
 
 def cell_size(controller: Any) -> int:
@@ -42,9 +40,13 @@ def cell_size(controller: Any) -> int:
     return BLOCK * (8 if isinstance(controller, (OpenLoop, Feedback, Policy)) else 1)
 
 
-def cell_key(stretch: Stretch) -> dict[str, Any] | None:
-    """All that a cell depends on, as plain data; None if what drives cannot be identified."""
-    fingerprint = controller_fingerprint(stretch.controller)
+def cell_key(stretch: Stretch, fingerprint: str | None) -> dict[str, Any] | None:
+    """All that a cell depends on, as plain data; None if what drives cannot be identified.
+
+    Args:
+        stretch: the cell.
+        fingerprint: of what drives, from :func:`controller_fingerprint`.
+    """
     if fingerprint is None:
         return None
     return {
@@ -63,7 +65,7 @@ def _software(controller: Any) -> dict[str, Any]:
     """Source and library versions that a controller's numbers depend on."""
     parts: tuple[str, ...]
     packages: tuple[str, ...]
-    if isinstance(controller, Policy):
+    if type(controller) is Policy:
         parts, packages = ("envs", "policy", "core"), ("numpy",)
     elif type(controller).__module__.startswith("slipcar.planner."):
         parts, packages = ("envs", "planner", "core"), _PLANNING
@@ -82,21 +84,17 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 
 def controller_fingerprint(controller: Any) -> str | None:
-    """What identifies a controller's behaviour: its own `fingerprint()`, else a digest.
+    """What identifies a controller's behaviour, or None if that cannot be told.
 
-    The digest covers its pickle and the source file of its class. Where that cannot be had
-    the answer is None and nothing of it is reused: better done twice than wrong.
+    Slipcar's own controllers say it themselves; of anybody else's the digest covers the code, what
+    it refers to, and the numbers it holds (:mod:`slipcar.evaluation.own.digest`). Where it cannot
+    be had nothing is reused: better done twice than wrong.
     """
     own = getattr(controller, "fingerprint", None)
-    if callable(own):
+    if type(controller).__module__.startswith("slipcar.") and callable(own):
         told = own()
         return None if told is None else f"{type(controller).__qualname__}:{told}"
-    try:
-        data = pickle.dumps(controller)
-        source = Path(inspect.getfile(type(controller))).read_bytes()
-    except Exception:  # whatever a user's object raises when pickled: it has no fingerprint
-        return None
-    return hashlib.sha256(data + source).hexdigest()
+    return behaviour_digest(controller)
 
 
 class Store:
@@ -110,6 +108,9 @@ class Store:
 
     def __init__(self, folder: str | Path | None = None, resume: bool = True) -> None:
         self.folder = None if folder is None else Path(folder) / "cells"
+        for place in () if folder is None else (Path(folder), Path(folder) / "cells"):
+            if place.exists() and not place.is_dir():
+                raise NotADirectoryError(f"{place} is a file, and results need a folder")
         self.resume = resume
         self.trouble = ""
         if folder is not None and self.folder is not None:
@@ -184,5 +185,5 @@ def read_cell(path: Path, key: dict[str, Any]) -> Measured | None:
                 return None
             metrics = EpisodeMetrics(**{field: data[field] for field in FIELDS})
         return Measured(metrics=metrics, **{field: header[field] for field in _SCALARS})
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+    except Exception:  # whatever NumPy, zipfile and zlib make of a damaged file
         return None

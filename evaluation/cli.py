@@ -56,7 +56,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             summaries, prog="slipcar", description=_DESCRIPTION, args=arguments
         )
     except SystemExit as stop:  # tyro has printed help (0) or what is wrong (2)
-        return int(stop.code or 0)
+        if stop.code is None or isinstance(stop.code, int):
+            return int(stop.code or 0)
+        print(f"slipcar {arguments[0]}: error: {stop.code}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt as stop:
         print(f"slipcar: interrupted{f': {stop}' if str(stop) else ''}", file=sys.stderr)
         return 130

@@ -21,7 +21,7 @@ from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts, evaluate
 from slipcar.evaluation.runs import Runs
-from slipcar.evaluation.statistics import episodes_for, half_width
+from slipcar.evaluation.statistics import episodes_for, half_width, rate_interval
 from slipcar.evaluation.suites.suite import Row
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, message, sweep
 
@@ -102,8 +102,8 @@ def compare(
     if not controllers:
         raise ValueError("compare needs at least one controller, not an empty mapping")
     for name, controller in controllers.items():
-        if not isinstance(name, str) or not name.strip():
-            raise ValueError(f"a row's name must be a non-empty string, not {name!r}")
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise ValueError(f"a row's name must be a non-empty string in one line, not {name!r}")
         if not isinstance(controller, Runs) and not _is_maker(controller):
             check_controller(controller)
     chosen = _reference(list(controllers), reference)
@@ -117,28 +117,34 @@ def compare(
         return [
             Job(name, label, one, scenario, counts[name], seed, substeps, time_limit)
             for name, controller in rows.items()
+            if name in counts
             for label, one in _trainings(controller).items()
         ]
 
     def expected() -> dict[str, int]:
-        return {name: counts[name] * trained[name] for name in rows}
+        return {name: counts[name] * trained[name] for name in counts}
 
+    swept = []
     with open_executor(n_jobs, cluster) as executor:
         with Bars(expected(), progress) as bars:
-            swept = sweep(jobs(), store, executor, bars)
-        results, errors = _rows(rows, swept)
+            swept.append(sweep(jobs(), store, executor, bars))
+        results, errors = _rows(rows, swept[0])
         if fixed is None and resolution is not None:
-            counts |= {name: needed(resolution, row) for name, row in results.items()}
+            counts = {name: needed(resolution, row) for name, row in results.items()}
             with Bars(expected(), progress) as bars:
-                swept = sweep(jobs(), store, executor, bars)
-            results, errors = _rows(rows, swept)
+                swept.append(sweep(jobs(), store, executor, bars))
+            results, more = _rows({name: rows[name] for name in counts}, swept[1])
+            errors |= more
     warnings = [*notes, store.trouble] if store.trouble else [*notes]
     if resolution is not None:
         warnings += _too_wide(results, resolution)
-    reused = {
-        name for name in results if all((name, v) in swept.reused for v in _trainings(rows[name]))
-    }
-    if folder is not None and resume and swept.computed and (others := store.foreign()):
+    reused = [
+        name
+        for name in results
+        if all((name, label) in part.reused for part in swept for label in _trainings(rows[name]))
+    ]
+    computed = sum(part.computed for part in swept)
+    if folder is not None and resume and computed and (others := store.foreign()):
         warnings.append(
             f"{others} finished cells in {store.folder} belong to other options or another version "
             "and were not used; they may be deleted"
@@ -152,7 +158,7 @@ def compare(
         controllers={name: rows.get(name, controllers[name]) for name in controllers},
         results=results,
         errors=unmade | errors,
-        reused=tuple(name for name in controllers if name in reused),
+        reused=tuple(reused),
         warnings=tuple(warnings),
         wall_time=time.perf_counter() - began,
         provenance=provenance(),
@@ -177,7 +183,7 @@ def _made(
             with time_limit(limit, "making the controller"):
                 rows[name] = controller(scenario)  # type: ignore[operator]
             check_controller(rows[name])
-        except Exception as error:  # one bad row must not cost the others
+        except (Exception, SystemExit) as error:  # one bad row must not cost the others
             rows.pop(name, None)
             errors[name] = message(error)
     return rows, errors
@@ -186,9 +192,10 @@ def _made(
 def needed(resolution: float, row: Result) -> int:
     """Episodes for a row whose interval is to be at most ± `resolution`, in whole blocks.
 
-    The rate is taken to be at the far end of the interval that the pilot left of it.
+    The rate is taken to be at the far end of the interval that the episodes so far left of it. Of
+    several trainings it is the paths' part alone: more episodes make no other trainings.
     """
-    low, high = row.collision_interval
+    low, high = rate_interval(row.per_path("collision"))
     rate = 0.5 if low < 0.5 < high else high if high <= 0.5 else low
     return min(MOST, max(PILOT, -(-episodes_for(resolution, rate) // BLOCK) * BLOCK))
 
@@ -221,14 +228,20 @@ def _too_wide(results: dict[str, Result], resolution: float) -> list[str]:
     """A warning for each row that cannot tell rates apart as finely as was asked for."""
     found = []
     for name, row in results.items():
-        half = half_width(row.collision_rate, row.episodes)
-        if half > resolution:
-            more = needed(resolution, row)
-            found.append(
-                f"{name}: its collision rate is known to ± {100 * half:.2g} %, not to the "
-                f"± {100 * resolution:g} % asked for"
-                + (f"; {more:,} episodes would do" if more < MOST else "; too fine to be had")
-            )
+        low, high = row.collision_interval
+        if 0.5 * (high - low) <= resolution:
+            continue
+        more = needed(resolution, row)
+        if half_width(row.collision_rate, row.episodes) <= resolution:
+            remedy = "it takes more trainings, not more episodes"
+        elif more < MOST:
+            remedy = f"{more:,} episodes would do"
+        else:
+            remedy = f"so fine a claim needs more than {MOST:,} episodes"
+        found.append(
+            f"{name}: its collision rate is known to ± {50 * (high - low):.2g} %, not to the "
+            f"± {100 * resolution:g} % asked for; {remedy}"
+        )
     return found
 
 

@@ -14,9 +14,13 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
+import hashlib
 import itertools
 import logging
 import os
+import pickle
+import platform
 import threading
 import time
 from collections import deque
@@ -59,12 +63,14 @@ class Executor:
         open: a pool to submit to, with the interface of `concurrent.futures`; called again when
             the pool broke. None works in this process.
         alive: raises LostWorkersError if nobody is left to work; called while waiting.
+        software: digest of the software that workers must have; None where they are this one's.
     """
 
     name: str = "this process"
     workers: int = 1
     open: Callable[[], Any] | None = None
     alive: Callable[[], None] = lambda: None
+    software: str | None = None
 
 
 def run(
@@ -88,8 +94,8 @@ def run(
             try:
                 with one_thread():
                     outcome = Outcome(task, work(task), None)
-            except Exception as error:  # one bad task must not cost the others
-                outcome = Outcome(task, None, error)
+            except (Exception, SystemExit) as error:  # one bad task must not cost the others
+                outcome = Outcome(task, None, _portable(error))
             yield outcome
         return
     yield from _run_in_pool(work, tasks, executor)
@@ -103,20 +109,26 @@ def _run_in_pool(
     under_way: dict[concurrent.futures.Future, Any] = {}
     suspects: deque[Any] = deque()  # were in some worker's hands when a worker died
     alone: Any = None  # the suspect that runs by itself, to see whether it was the cause
+    exhausted = False
     try:
-        while True:
-            if suspects:
-                if not under_way:
-                    alone = suspects.popleft()
-                    under_way[pool.submit(_guarded, work, alone)] = alone
-            else:
-                # Two each, so that nobody waits for the next.
-                for task in itertools.islice(
-                    waiting, max(0, 2 * executor.workers - len(under_way))
-                ):
-                    under_way[pool.submit(_guarded, work, task)] = task
+        while not exhausted or suspects or under_way:
+            # Two each, so that nobody waits for the next; suspects one at a time.
+            free = 0 if suspects else 2 * executor.workers - len(under_way)
+            ready = list(itertools.islice(waiting, free)) if free > 0 and not exhausted else []
+            exhausted = exhausted or (free > 0 and len(ready) < free)
+            if suspects and not under_way:
+                alone = suspects.popleft()
+                ready = [alone]
+            for task in ready:
+                try:
+                    under_way[pool.submit(_guarded, work, task, executor.software)] = task
+                except concurrent.futures.BrokenExecutor:
+                    suspects.append(task)
+                    pool = executor.open()
+                except Exception as error:  # it cannot even be sent
+                    yield Outcome(task, None, error)
             if not under_way:
-                return
+                continue
             done, _ = concurrent.futures.wait(
                 under_way, timeout=2.0, return_when=concurrent.futures.FIRST_COMPLETED
             )
@@ -160,17 +172,40 @@ def _killer(executor: Executor) -> LostWorkersError:
     )
 
 
-def _guarded(work: Callable[[Any], Any], task: Any) -> Any:
+def _guarded(work: Callable[[Any], Any], task: Any, software: str | None) -> Any:
     """In a worker: one task at a time in a process, on one thread.
 
     Dask workers may have several threads, but BLAS limits and planners' workspaces are the
-    process's.
+    process's. A worker that joined a cluster late may have other software than those that were
+    checked.
     """
+    if software is not None and _software() != software:
+        raise RuntimeError(
+            f"a worker of the cluster has other software than this process: {worker_facts()}"
+        )
     with _alone:
         for name, value in ENVIRONMENT.items():  # what a task may still import, torch say
             os.environ.setdefault(name, value)
-        with one_thread():
-            return work(task)
+        try:
+            with one_thread():
+                return work(task)
+        except (Exception, SystemExit) as error:
+            raise _portable(error) from None
+
+
+def _portable(error: BaseException) -> BaseException:
+    """The error itself if it can be sent between processes, else one that says the same."""
+    if not isinstance(error, SystemExit):
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            pass
+        else:
+            return error
+    told = RuntimeError(f"{type(error).__name__}: {error}")
+    for note in getattr(error, "__notes__", []):
+        told.add_note(note)
+    return told
 
 
 @contextlib.contextmanager
@@ -195,7 +230,8 @@ def open_executor(workers: int = 1, cluster: str | None = None) -> Iterator[Exec
             yield executor
         return
     scheme, _, address = str(cluster).partition("://")
-    if scheme not in ("dask", "dask+tls") or bool(address) != ("://" in str(cluster)):
+    known = str(cluster) == "dask" or (scheme in ("dask", "dask+tls") and address)
+    if not known:
         raise ValueError(f"unknown cluster {cluster!r}: it is one of {CLUSTERS}")
     try:
         import distributed
@@ -247,7 +283,14 @@ def _dask(stack: contextlib.ExitStack, address: str) -> Executor:
             f"({type(error).__name__}): start one with `dask scheduler`, and on each machine "
             f"`dask worker {address} --nthreads 1 --nworkers auto`"
         ) from None
-    _check_versions(client.run(worker_facts), address)
+    try:
+        facts = client.run(worker_facts)
+    except Exception as error:
+        raise ValueError(
+            f"the workers of the cluster at {address} cannot import slipcar "
+            f"({type(error).__name__}: {error}): install the same version there"
+        ) from None
+    _check_versions(facts, address)
     threads = client.nthreads()
     last_seen = time.monotonic()
 
@@ -263,7 +306,9 @@ def _dask(stack: contextlib.ExitStack, address: str) -> Executor:
             )
 
     executor = client.get_executor(pure=False)
-    return Executor(f"the Dask cluster at {address}", len(threads), lambda: executor, alive)
+    return Executor(
+        f"the Dask cluster at {address}", len(threads), lambda: executor, alive, _software()
+    )
 
 
 def worker_facts() -> dict[str, str]:
@@ -271,8 +316,14 @@ def worker_facts() -> dict[str, str]:
     found = versions()
     return {
         "code": code_digest("envs", "planner", "policy", "core"),
+        "python": platform.python_version(),
         **{name: found.get(name, "none") for name in _SAME},
     }
+
+
+@functools.cache
+def _software() -> str:
+    return hashlib.sha256(repr(sorted(worker_facts().items())).encode()).hexdigest()
 
 
 def _check_versions(workers: dict[str, dict[str, str]], address: str) -> None:

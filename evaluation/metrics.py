@@ -17,11 +17,14 @@ from slipcar.evaluation.statistics import (
     rate_interval,
     standard_error,
     student_interval,
+    welch,
 )
 
 #: Quantiles that tables show: of the clearance, and of a path's cost.
 CLEARANCE_QUANTILES = (0.01, 0.05, 0.5)
 COST_QUANTILES = (0.5, 0.95, 0.99)
+#: Metrics that are 0 or 1, or between.
+RATES = ("collision", "touched")
 #: Share of the worst episodes that a conditional value at risk averages.
 TAIL = 0.05
 
@@ -188,17 +191,25 @@ class Result:
     def difference(self, reference: Result, metric: str) -> Interval:
         """Mean paired difference to another row over the paths both met, and its interval.
 
-        BCa bootstrap; between rows with several runs, Student's t over runs and paths.
+        BCa bootstrap; between rows with several runs, Student's t over runs and paths (Welch).
         """
         n = min(self.episodes, reference.episodes)
         values, others = self.per_path(metric)[:n], reference.per_path(metric)[:n]
         if not self.runs and not reference.runs:
-            return paired_difference(values, others)
-        parts = [standard_error(values - others)]
-        parts += [standard_error(row.per_run(metric, n)) for row in (self, reference) if row.runs]
-        trainings = [len(row.runs) for row in (self, reference) if row.runs]
-        error = float(np.sqrt(np.sum(np.square(parts))))
-        return student_interval(float(np.mean(values - others)), error, min(trainings) - 1)
+            found = paired_difference(values, others)
+            if found.low == found.high and metric in RATES:
+                # No path tells them apart: rarer than that is what can be said.
+                bound = rate_interval(np.zeros(n))[1]
+                found = Interval(found.mean, found.low - bound, found.high + bound)
+            return found
+        parts = [(standard_error(values - others), n)]
+        parts += [
+            (standard_error(row.per_run(metric, n)), len(row.runs))
+            for row in (self, reference)
+            if row.runs
+        ]
+        error, freedom = welch(*parts)
+        return student_interval(float(np.mean(values - others)), error, freedom)
 
     @property
     def collision_rate(self) -> float:
@@ -348,9 +359,11 @@ class Result:
         low, high = rate_interval(values)
         if self.runs:
             # Never narrower than for a single controller, also where no run ever collided.
-            _, lower, higher = student_interval(
-                float(values.mean()), self._error(metric), len(self.runs) - 1
+            error, freedom = welch(
+                (standard_error(values), self.episodes),
+                (standard_error(self.per_run(metric)), len(self.runs)),
             )
+            _, lower, higher = student_interval(float(values.mean()), error, freedom)
             low, high = max(0.0, min(low, lower)), min(1.0, max(high, higher))
         return low, high
 

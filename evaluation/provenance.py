@@ -15,7 +15,8 @@ from typing import Any
 
 PACKAGES = (
     "slipcar", "numpy", "scipy", "pandas", "gymnasium", "array-api-compat", "safetensors",
-    "joblib", "distributed", "matplotlib", "torch", "stable-baselines3", "osqp", "cvxpy", "numba",
+    "joblib", "distributed", "matplotlib", "torch", "stable-baselines3", "sb3-contrib", "osqp",
+    "cvxpy", "numba",
 )  # fmt: skip
 _FOLDERS = ("envs", "planner", "baselines", "evaluation")
 
@@ -86,9 +87,17 @@ PARTS = {
     "envs": ("envs/*.py",),
     "planner": ("planner/**/*.py",),
     "policy": ("baselines/policy.py",),
-    "core": tuple(
-        f"evaluation/{name}.py"
-        for name in ("between", "cells", "controller", "makers", "metrics", "noise", "rollout")
+    "core": (
+        "baselines/deterministic.py",
+        "baselines/straight.py",
+        "evaluation/own/*.py",
+        *(
+            f"evaluation/{name}.py"
+            for name in (
+                *("between", "cells", "controller", "makers", "metrics", "noise", "rollout"),
+                "threads",
+            )
+        ),
     ),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 
 from slipcar.evaluation.controller import Controller, check_controller
@@ -41,3 +42,12 @@ class Runs:
         known = None not in seeds and len(set(seeds)) == len(seeds)
         labels = [f"seed {seed}" if known else f"run {i}" for i, seed in enumerate(seeds)]
         return cls(tuple(policies), tuple(labels))
+
+    def fingerprint(self) -> str | None:
+        """Identifies all of them; None if one cannot be identified."""
+        from slipcar.evaluation.cells import controller_fingerprint
+
+        told = [controller_fingerprint(controller) for controller in self.controllers]
+        if None in told:
+            return None
+        return hashlib.sha256(repr(told).encode()).hexdigest()[:16]

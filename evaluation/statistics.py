@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from typing import NamedTuple
 
@@ -19,13 +20,15 @@ __all__ = [
     "rate_interval",
     "standard_error",
     "student_interval",
+    "welch",
     "wilson_interval",
 ]
 
 #: Bootstrap replications.
 RESAMPLES = 2000
-#: Samples with more different values than this are sorted into as many groups of neighbours.
-GROUPS = 4096
+#: Samples with more different values than this are sorted into as many groups of neighbours, and
+#: so many values at either end stay by themselves.
+GROUPS, EXTREMES = 4096, 1024
 #: Up to so many values no groups are made.
 UNGROUPED = 32_768
 
@@ -121,7 +124,8 @@ def bca_interval(
     a = Σ (x_i − x̄)³ / (6 (Σ (x_i − x̄)²)^{3/2}). A bootstrap sample of n values out of g different
     ones is a multinomial draw of counts, so what is drawn grows with g and not with n. Many
     different values are sorted into :data:`GROUPS` groups of neighbours, each standing for its
-    mean: what is lost is the variance within groups, a millionth or so.
+    mean, the extreme ones each for itself; what variance is lost within groups is put back by a
+    factor on the deviations.
 
     Args:
         values: (n,), finite.
@@ -164,12 +168,15 @@ def _resampled_means(values: np.ndarray, resamples: int, rng: np.random.Generato
             return _by_index(values, resamples, rng)
     else:
         different, counts = _groups(values)
+    kept = float(counts @ (different - counts @ different / n) ** 2)
+    # What lies within groups is missing in their variance, and put back.
+    scale = np.sqrt(n * np.var(values) / kept)
     # 16 MB of counts at a time, whatever the size.
     means = []
     for first in range(0, resamples, size := max(1, 2_000_000 // len(different))):
         drawn = rng.multinomial(n, counts / n, size=min(size, resamples - first))
         means.append(drawn @ different / n)
-    return np.concatenate(means)
+    return scale * np.concatenate(means)
 
 
 def _by_index(values: np.ndarray, resamples: int, rng: np.random.Generator) -> np.ndarray:
@@ -187,13 +194,15 @@ def _groups(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ordered = np.sort(values)
     first = np.flatnonzero(np.diff(ordered, prepend=-np.inf))
     if len(first) > GROUPS:
-        first = np.arange(GROUPS) * len(ordered) // GROUPS
+        n = len(ordered)
+        middle = EXTREMES + np.arange(GROUPS) * (n - 2 * EXTREMES) // GROUPS
+        first = np.concatenate([np.arange(EXTREMES), middle, np.arange(n - EXTREMES, n)])
     counts = np.diff(first, append=len(ordered))
     return np.add.reduceat(ordered, first) / counts, counts
 
 
 def student_interval(
-    mean: float, error: float, freedom: int, level: float = CONFIDENCE
+    mean: float, error: float, freedom: float, level: float = CONFIDENCE
 ) -> Interval:
     """Interval of a mean from its standard error, by Student's t.
 
@@ -202,16 +211,30 @@ def student_interval(
     Args:
         mean: the mean.
         error: its standard error, of trainings and paths together.
-        freedom: degrees of freedom: trainings less one; below 1 the normal distribution is taken.
+        freedom: degrees of freedom, see :func:`welch`; inf takes the normal distribution.
         level: coverage, in (0, 1).
     """
-    if freedom < 1:
+    if math.isinf(freedom):
         factor = statistics.NormalDist().inv_cdf(0.5 + 0.5 * level)
     else:
         from scipy import stats  # here: half a second that `--help` need not wait
 
         factor = float(stats.t.ppf(0.5 + 0.5 * level, freedom))
     return Interval(mean, mean - factor * error, mean + factor * error)
+
+
+def welch(*parts: tuple[float, int]) -> tuple[float, float]:
+    """Standard error and degrees of freedom of a sum of independent parts (Welch, Satterthwaite).
+
+    Args:
+        *parts: standard errors, and the sizes of the samples they were estimated from (>= 2).
+
+    Returns:
+        √Σ s², and (Σ s²)² / Σ (s⁴ / (n − 1)); inf where all parts are zero.
+    """
+    total = sum(error**2 for error, _ in parts)
+    spread = sum(error**4 / max(1, size - 1) for error, size in parts)
+    return math.sqrt(total), (total**2 / spread if spread > 0.0 else float("inf"))
 
 
 def half_width(rate: float, episodes: int) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from slipcar.envs.scenario import Scenario
-from slipcar.evaluation.cells import Store, cell_key, cell_size
+from slipcar.evaluation.cells import Store, cell_key, cell_size, controller_fingerprint
 from slipcar.evaluation.controller import Controller
 from slipcar.evaluation.executors import Executor, Outcome, run
 from slipcar.evaluation.metrics import Result
@@ -108,13 +108,14 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
     """
     done: dict[tuple[str, str], dict[int, Measured]] = {job.name: {} for job in jobs}
     counts: dict[tuple[str, str], int] = {}
-    errors: dict[tuple[str, str], str] = {}
+    failed: dict[tuple[str, str], dict[int, str]] = {}
     missing: list[_Piece] = []
     for job in jobs:
         stretches = job.stretches()
+        fingerprint = controller_fingerprint(job.controller)
         counts[job.name] = len(stretches)
         for index, stretch in enumerate(stretches):
-            key = cell_key(stretch)
+            key = cell_key(stretch, fingerprint)
             found = store.get(key)
             if found is None:
                 missing.append(_Piece(job.name, index, key, stretch))
@@ -125,21 +126,22 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
 
     def wanted() -> Iterator[_Piece]:
         for piece in missing:
-            if piece.job not in errors:
+            if piece.job not in failed:
                 yield piece
 
     computed = 0
     for piece, measured, error in _computed(wanted(), executor):
         row, _ = piece.job
         if error is not None:
-            if piece.job not in errors:
-                errors[piece.job] = message(error)
-                bars.note(row, "failed")
+            failed.setdefault(piece.job, {})[piece.index] = message(error)
+            bars.note(row, "failed")
             continue
         computed += 1
         done[piece.job][piece.index] = measured
         store.put(piece.key, measured)
         bars.advance(row, piece.stretch.episodes)
+    # Cells are handed out in order: the first that failed is the same, whoever was quicker.
+    errors = {job: found[min(found)] for job, found in failed.items()}
     results = {
         job.name: joined(
             [done[job.name][index] for index in range(counts[job.name])],
@@ -163,4 +165,5 @@ def _measured(piece: _Piece) -> Measured:
 
 def message(error: BaseException) -> str:
     """An error in one line, with what was noted on its way."""
-    return "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    told = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    return " ".join(told.split())

@@ -94,7 +94,15 @@ class OpenLoop:
         return digest.hexdigest()
 
     def _numbers(self) -> list[Array]:
-        return [self.plan.times, self.plan.controls]
+        return [self.plan.times, self.plan.controls, *self._limits()]
+
+    def _limits(self) -> list[Array]:
+        """What the problem does to controls on their way to actions."""
+        problem, m = self.plan.problem, self.plan.controls.shape[1]
+        bounds = control_limits(getattr(problem, "control_bounds", None), m)
+        radius = control_ball(getattr(problem, "control_radius", None), *bounds)
+        angles = np.asarray(getattr(problem, "angles", ()), dtype=np.int64)
+        return [*bounds, np.array([radius]), angles]
 
     def _interval(self, t: Any) -> Array:
         # Observations are float32, so a node's time may come back a little early.

@@ -29,6 +29,11 @@ _PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes, np.gener
 _RANDOM = {
     "random", "rand", "randn", "randint", "rand_like", "randn_like", "bernoulli", "multinomial",
 }  # fmt: skip
+#: Members of a class that change nothing; pickling adds `__slotnames__`.
+_NOT_BEHAVIOUR = {
+    "__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__slotnames__",
+    "__firstlineno__", "__static_attributes__",
+}  # fmt: skip
 
 
 class _UnknownError(Exception):
@@ -115,7 +120,8 @@ def _function(function: types.FunctionType, seen: _Seen) -> Iterator[str | bytes
         yield f"{installed} {function.__qualname__}"
         return
     yield from _parts(function.__code__, seen)
-    yield from _each((function.__defaults__, function.__kwdefaults__), seen)
+    # Its attributes say how it is called: per_row, observation, rows.
+    yield from _each((function.__defaults__, function.__kwdefaults__, function.__dict__), seen)
     for cell in function.__closure__ or ():
         yield from _parts(cell.cell_contents, seen)
     names = _names(function.__code__)
@@ -140,7 +146,7 @@ def _class(kind: type, seen: _Seen) -> Iterator[str | bytes]:
     yield f"class {kind.__qualname__}"
     yield from _each(kind.__bases__, seen)
     for name, value in sorted(vars(kind).items()):
-        if name in ("__dict__", "__weakref__", "__doc__", "__module__", "__annotations__"):
+        if name in _NOT_BEHAVIOUR:
             continue
         if isinstance(value, (types.MemberDescriptorType, types.GetSetDescriptorType)):
             continue

@@ -106,7 +106,7 @@ def test_all_rows_may_fail(paper):
     ("change", "message"),
     [
         ({"controllers": {}}, "at least one controller"),
-        ({"controllers": {"": None}}, "non-empty string, not ''"),
+        ({"controllers": {"": None}}, "non-empty string in one line, not ''"),
         ({"controllers": {"a": 3}}, "predict"),
         ({"reference": "b"}, r"unknown reference 'b'; the rows are \['a'\]"),
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
@@ -197,7 +197,8 @@ def test_json_says_how_to_repeat_it(rows, paper):
     assert (data["seed"], data["episodes"], data["substeps"]) == (3, EPISODES, 1)
     assert data["reference"] == "SCP"
     assert [row["controller"] for row in data["rows"]] == list(rows)
-    assert data["rows"][1]["fingerprint"] == "Counted:turning"
+    prints = [row["fingerprint"] for row in data["rows"]]
+    assert len(set(prints)) == 3  # by what they are called
     assert data["rows"][0]["clearance_p05"] is None  # JSON has no infinity
     told = data["provenance"]
     assert told["versions"]["numpy"] == np.__version__

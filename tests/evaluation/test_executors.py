@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -81,12 +82,34 @@ def test_what_kills_every_worker_is_told_and_the_others_go_on():
     assert [outcomes[i].value for i in (0, 1, 3, 4, 5)] == [0, 1, 3, 4, 5]
 
 
+def test_what_cannot_be_sent_is_a_failed_task_and_errors_come_as_they_are():
+    class Odd(Exception):  # noqa: N818  two arguments: it cannot be unpickled
+        def __init__(self, one, two):
+            super().__init__(f"{one} {two}")
+
+    def work(task):
+        if task == 1:
+            raise Odd("no", "fuel")
+        if task == 2:
+            raise SystemExit(3)
+        return task
+
+    tasks = [0, 1, 2, threading.Lock(), 4]
+    with open_executor(2) as executor:
+        outcomes = {str(o.task)[:5]: o for o in run(work, tasks, executor)}
+    assert str(outcomes["1"].error) == "Odd: no fuel"
+    assert str(outcomes["2"].error) == "SystemExit: 3"
+    assert isinstance(outcomes["<unlo"].error, Exception)
+    assert (outcomes["0"].value, outcomes["4"].value) == (0, 4)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
         ({"workers": 0}, ValueError, "workers must be at least 1, not 0"),
         ({"cluster": "slurm"}, ValueError, "unknown cluster 'slurm'.*dask://HOST:PORT"),
         ({"cluster": "dask://"}, ValueError, "unknown cluster 'dask://'"),
+        ({"cluster": "dask+tls"}, ValueError, r"unknown cluster 'dask\+tls'"),
         ({"cluster": "http://a:1"}, ValueError, "unknown cluster"),
     ],
 )

@@ -9,6 +9,7 @@ from slipcar.evaluation.statistics import (
     paired_difference,
     standard_error,
     student_interval,
+    welch,
     wilson_interval,
 )
 
@@ -176,4 +177,19 @@ def test_bad_resolutions_are_named(resolution, rate):
 def test_a_method_is_less_certain_than_its_trainings():
     mean, low, high = student_interval(5.0, 0.1, freedom=4)
     assert (mean - low, high - mean) == (pytest.approx(0.2776, rel=1e-3),) * 2
-    assert student_interval(5.0, 0.1, freedom=0).high == pytest.approx(5.196, rel=1e-4)
+    assert student_interval(5.0, 0.1, float("inf")).high == pytest.approx(5.196, rel=1e-4)
+
+
+def test_freedom_is_that_of_the_part_that_dominates():
+    assert welch((0.1, 10_000), (1e-9, 3))[1] == pytest.approx(9999)
+    assert welch((1e-9, 10_000), (0.1, 3))[1] == pytest.approx(2)
+    error, freedom = welch((0.3, 5), (0.4, 5))
+    assert error == pytest.approx(0.5)
+    assert freedom == pytest.approx(0.5**4 / ((0.3**4 + 0.4**4) / 4))
+
+
+def test_heavy_tails_keep_their_variance_in_groups():
+    values = np.random.default_rng(9).lognormal(sigma=2.0, size=200_000)
+    _, low, high = bca_interval(values)
+    half = 1.96 * standard_error(values)
+    assert high - low == pytest.approx(2.0 * half, rel=0.1)

@@ -1,7 +1,9 @@
 """Finished work: kept as it comes, found again, and never taken for something else."""
 
+import importlib.util
 import resource
 import signal
+import sys
 import time
 
 import numpy as np
@@ -11,10 +13,11 @@ from slipcar.evaluation import compare
 from slipcar.evaluation.cells import Store, cell_name, controller_fingerprint
 from slipcar.evaluation.metrics import FIELDS, Result
 from slipcar.evaluation.noise import BLOCK
+from slipcar.evaluation.own import as_controller
 from slipcar.evaluation.provenance import code_digest
 from slipcar.evaluation.runs import Runs
 from slipcar.evaluation.statistics import half_width, standard_error
-from slipcar.planner import OpenLoop, plan
+from slipcar.planner import Feedback, OpenLoop, plan
 
 
 class Named:
@@ -216,6 +219,19 @@ def test_bad_runs_are_named(row, labels, message):
         Runs((row, row), labels)
 
 
+def test_more_episodes_are_not_asked_of_what_needs_more_trainings(trained, paper):
+    (warning,) = run({"a": trained}, paper, 20_000, resolution=0.006).warnings
+    assert "it takes more trainings, not more episodes" in warning
+
+
+def test_rows_that_never_differ_differ_rarely(row, paper):
+    found = run({"SCP": row, "twin": row}, paper, 1000).frame.loc["twin"]
+    assert found["collision_difference"] == 0.0
+    # No discordant path in 1000: rarer than 0.4 %, not never.
+    assert found["collision_difference_high"] == pytest.approx(0.0038, abs=2e-4)
+    assert found["collision_difference_low"] == -found["collision_difference_high"]
+
+
 def test_one_training_is_a_row_like_any_other(row, paper):
     result = run({"a": row}, paper, 100).results["a"]
     assert Result.of_runs([result]) is result
@@ -243,12 +259,126 @@ def test_a_resolution_gives_each_row_the_episodes_it_needs(paper, tmp_path):
 
 def test_an_interval_too_wide_for_the_claim_is_told(row, paper):
     (warning,) = run({"a": row}, paper, 500, resolution=0.001).warnings
+    assert "episodes would do" in warning
     assert warning.startswith("a: its collision rate is known to ± ")
     assert "not to the ± 0.1 % asked for" in warning
     with pytest.raises(ValueError, match="resolution must be between 0 and"):
         run({"a": row}, paper, resolution=0.7)
 
 
-def test_a_fingerprint_may_be_unknown(row):
-    row.fingerprint = lambda: None
-    assert controller_fingerprint(row) is None
+# ------------------------------------------------------------------ what identifies a controller
+
+
+def written(folder, name, text):
+    path = folder / f"{name}.py"
+    path.write_text(text, encoding="utf-8")
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+DRIVER = """
+import numpy as np
+
+GAIN = {gain}
+
+
+def wanted(rows):
+    return GAIN * np.ones((rows, 2))
+
+
+class Driver:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return wanted(len(observation)), state
+"""
+
+
+def test_edited_code_is_another_controller(tmp_path):
+    prints = set()
+    for gain in (0.1, 0.2, 0.1):
+        module = written(tmp_path, "slipcar_test_driver", DRIVER.format(gain=gain))
+        prints.add(controller_fingerprint(module.Driver()))
+    del sys.modules["slipcar_test_driver"]
+    assert len(prints) == 2
+    assert None not in prints
+
+
+def test_a_subclass_does_not_pass_for_what_it_inherits_from(paper):
+    class Half(OpenLoop):
+        def predict(self, observation, **rest):
+            action, state = super().predict(observation, **rest)
+            return 0.5 * action, state
+
+    p = plan(paper)
+    assert controller_fingerprint(Half(p)) != controller_fingerprint(OpenLoop(p))
+
+
+def test_a_plan_for_other_bounds_is_another_controller(paper):
+    p = plan(paper)
+    wide = p.replace(problem=paper.replace(control_bounds=(3.0, 6.0)))
+    assert OpenLoop(p).fingerprint() != OpenLoop(wide).fingerprint()
+    assert Feedback(p).fingerprint() != Feedback(wide).fingerprint()
+
+
+def test_how_a_function_is_called_identifies_it(paper):
+    def still(observation):
+        return np.zeros((len(observation), 2))
+
+    one = as_controller(still, paper).fingerprint()
+    still.observation = "state"
+    assert as_controller(still, paper).fingerprint() != one
+
+
+def test_what_cannot_be_told_is_never_reused(paper, layers, tmp_path):
+    controller = layers()
+    assert controller_fingerprint(controller) == controller_fingerprint(layers())
+    controller.rng = np.random.default_rng(0)  # what it may do with that cannot be told
+    assert controller_fingerprint(controller) is None
+    run({"a": controller}, paper, 100, folder=tmp_path)
+    assert run({"a": controller}, paper, 100, folder=tmp_path).reused == ()
+
+
+def test_driving_does_not_change_a_fingerprint(trained, paper):
+    before = controller_fingerprint(trained)
+    run({"a": trained}, paper, 100)
+    assert controller_fingerprint(trained) == before
+
+
+# ------------------------------------------------------------------ one row and the others
+
+
+def test_a_controller_that_exits_is_a_failed_row(row, paper):
+    class Exits:
+        def predict(self, observation, **rest):
+            raise SystemExit(0)
+
+    def exits(scenario):
+        raise SystemExit("bye")
+
+    found = run({"Exits": Exits(), "exits": exits, "a": row}, paper, 100)
+    assert "SystemExit" in found.errors["Exits"]
+    assert "SystemExit: bye" in found.errors["exits"]
+    assert list(found.results) == ["a"]
+
+
+def test_errors_are_one_line_and_the_first_in_order(paper, row):
+    class Multi:
+        def predict(self, observation, **rest):
+            raise ValueError("one\n\n# two\n| three |")
+
+    alone = run({"a": Multi()}, paper, 3000)
+    spread = run({"a": Multi()}, paper, 3000, n_jobs=2)
+    assert alone.errors == spread.errors
+    assert alone.errors["a"].startswith("ValueError: one # two | three |; raised by Multi.predict")
+    assert "episodes 0 to 1023" in alone.errors["a"]
+    with pytest.raises(ValueError, match="in one line"):
+        run({"a\nb": row}, paper)
+
+
+def test_a_folder_that_is_a_file_is_refused_before_anything_is_driven(row, paper, tmp_path):
+    (tmp_path / "results").write_text("")
+    with pytest.raises(OSError, match="is a file, and results need a folder"):
+        run({"a": row}, paper, folder=tmp_path / "results")
+    assert row.calls == 0
