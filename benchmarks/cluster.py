@@ -13,6 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from joblib.externals.loky import get_reusable_executor
+
 from slipcar.envs import Scenario
 from slipcar.evaluation import compare
 from slipcar.evaluation.rows import REFERENCE, default_rows
@@ -28,6 +30,8 @@ def main() -> int:
     rows, _ = default_rows(paper)
 
     def run(cluster: str, episodes: int) -> tuple[float, bytes]:
+        # loky would keep its workers from one round to the next, Dask's are new each time.
+        get_reusable_executor().shutdown(wait=True, kill_workers=True)
         began = time.perf_counter()
         done = compare(
             rows,

@@ -15,8 +15,8 @@ from slipcar.evaluation.report.text import machine, markdown_table
 SUITES = ("random", "slip", "horizon")
 HEAD = """# Suites
 
-What the suites of `slipcar compare` found; [comparison.md](comparison.md) says what the numbers mean.
-Made by `make suites` and `python benchmarks/suites_page.py`: nothing here is typed by hand.
+What the suites of `slipcar compare` found; [comparison.md](comparison.md) says what the numbers
+mean. Made by `make suites` and `python benchmarks/suites_page.py`: nothing here is typed by hand.
 """
 
 

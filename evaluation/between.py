@@ -4,15 +4,18 @@ Between two Euler–Maruyama nodes a and b, h apart, the continuous path is a Br
 the chord, with the diffusion of the step: D = σσᵀ of the position at a. By the reflection
 principle it enters a half plane whose border both ends keep away from, by d_a and d_b, with
 probability exp(−2 d_a d_b / (h nᵀDn)), n the normal. Of the half planes that touch an obstacle's
-rim the one with the largest d_a d_b counts; that the rim curves away from it, with radius δ, is
-worth a factor:
+rim the one with the largest d_a d_b / nᵀDn counts; that the rim curves away from it, with radius
+δ, is worth a factor:
 
-    q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ (d_a + d_b)))
+    q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ cos²ϑ (d_a + d_b)))
 
-and q = 1 where the chord itself enters. (Laplace's method at the shortest way from a to the rim to
-b; Baldi 1995 has such asymptotics for domains in general, Gobet 2000 the half plane.) Given its
-nodes, a path collides with probability 1 − Π (1 − q) over intervals and obstacles; the mean over
-paths is the rate. No random number is drawn for it.
+with ϑ the angle at which the shortest way from a to the rim to b meets n, and q = 1 where the chord
+itself enters. That factor is for the same noise in all directions; another stretches the plane to
+such a one, in which the rim is an ellipse, whose radius at n is the one that counts: δ becomes
+δ (nᵀDn)² / det D. (Laplace's method at that shortest way; Baldi 1995 has such asymptotics for
+domains in general, Gobet 2000 the half plane.) Given its nodes, a path collides with probability
+1 − Π (1 − q) over intervals and obstacles; the mean over paths is the rate. No random number is
+drawn for it.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ _FAR = 4.0
 _STEPS = 4
 #: No step turns it farther than this, as a tangent.
 _TURN = 0.5
+#: Where noise depends on direction: angles that are looked at, and how often between neighbours.
+_ANGLES, _CLOSER = 33, 4
 
 
 def log_clear(
@@ -108,6 +113,10 @@ def _touched(
     distance = np.sqrt(nx * nx + ny * ny)
     inside = distance <= radius
     nx, ny = nx / np.maximum(distance, 1e-300), ny / np.maximum(distance, 1e-300)
+    uneven = np.flatnonzero(~inside & (variance_x != variance_y))
+    if len(uneven):
+        sides = [part[uneven] for part in (ax, ay, bx, by, radius, variance_x, variance_y)]
+        turned = _turned(nx[uneven], ny[uneven], *sides)
     # From that point's direction, Newton's method in the angle of n on the product of n·a − δ and
     # n·b − δ, which is concave between the directions of a and b, where its maximum lies.
     for _ in range(_STEPS):
@@ -120,13 +129,79 @@ def _touched(
         nx, ny = nx - step * ny, ny + step * nx
         norm = np.sqrt(nx * nx + ny * ny)
         nx, ny = nx / norm, ny / norm
+    if len(uneven):
+        nx[uneven], ny[uneven] = turned
     gap_a, gap_b = nx * ax + ny * ay - radius, nx * bx + ny * by - radius
     clear = ~inside & (gap_a > 0.0) & (gap_b > 0.0)
     gap_a, gap_b = np.where(clear, gap_a, 0.0), np.where(clear, gap_b, 0.0)
     variance = nx * nx * variance_x + ny * ny * variance_y
     product = gap_a * gap_b
+    # a and b along the rim: d_a d_b / cos²ϑ is d_a d_b − t_a t_b, for both meet n at one angle.
+    oblique = product - (nx * ay - ny * ax) * (nx * by - ny * bx)
+    if len(uneven):
+        sides = [part[uneven] for part in (nx, ny, ax, ay, bx, by, radius, variance_x, variance_y)]
+        oblique[uneven] = product[uneven] - variance[uneven] * _along(*sides)
+        determinant = np.maximum(variance_x * variance_y, 1e-300)[uneven]
+        radius = radius.copy()
+        radius[uneven] *= variance[uneven] ** 2 / determinant
     # Without noise the path is the chord: exp(−∞).
     with np.errstate(divide="ignore", invalid="ignore"):
         straight = np.exp(-2.0 * product / variance)
-        bend = np.sqrt(1.0 + 2.0 * product / (radius * (gap_a + gap_b)))
+        bend = np.sqrt(1.0 + 2.0 * np.maximum(oblique, 0.0) / (radius * (gap_a + gap_b)))
         return np.where(clear, straight / bend, 1.0)
+
+
+def _along(
+    nx: np.ndarray,
+    ny: np.ndarray,
+    ax: np.ndarray,
+    ay: np.ndarray,
+    bx: np.ndarray,
+    by: np.ndarray,
+    radius: np.ndarray,
+    variance_x: np.ndarray,
+    variance_y: np.ndarray,
+) -> np.ndarray:
+    """Product of how far a and b lie along the rim where noise is even: stretched by D^(-1/2)."""
+    weight_x, weight_y = 1.0 / np.maximum(variance_x, 1e-300), 1.0 / np.maximum(variance_y, 1e-300)
+    tangent = ny * ny * weight_x + nx * nx * weight_y
+    a, b = (
+        nx * (y - radius * ny) * weight_y - ny * (x - radius * nx) * weight_x
+        for x, y in ((ax, ay), (bx, by))
+    )
+    return a * b / tangent
+
+
+def _turned(
+    nx: np.ndarray,
+    ny: np.ndarray,
+    ax: np.ndarray,
+    ay: np.ndarray,
+    bx: np.ndarray,
+    by: np.ndarray,
+    radius: np.ndarray,
+    variance_x: np.ndarray,
+    variance_y: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The normal with the largest d_a d_b / nᵀDn, which may have several maxima; all (rows,).
+
+    Looked for on a grid of angles, then on finer ones round the best, among the half planes that
+    keep a and b out; (nx, ny) is one of them. Other arguments are as in :func:`_touched`.
+    """
+    low, high = np.full(len(nx), -np.pi), np.full(len(nx), np.pi)
+    for x, y in ((ax, ay), (bx, by)):
+        towards = np.arctan2(nx * y - ny * x, nx * x + ny * y)  # from n to the node
+        width = np.arccos(np.clip(radius / np.sqrt(x * x + y * y), 0.0, 1.0))
+        low, high = np.maximum(low, towards - width), np.minimum(high, towards + width)
+    rows, shares = np.arange(len(nx)), np.linspace(0.0, 1.0, _ANGLES)[:, None]
+    for _ in range(_CLOSER):
+        angles = low + shares * (high - low)  # (_ANGLES, rows)
+        c, s = np.cos(angles), np.sin(angles)
+        tx, ty = nx * c - ny * s, ny * c + nx * s
+        gap_a, gap_b = tx * ax + ty * ay - radius, tx * bx + ty * by - radius
+        variance = np.maximum(tx * tx * variance_x + ty * ty * variance_y, 1e-300)
+        quotient = np.maximum(gap_a, 0.0) * np.maximum(gap_b, 0.0) / variance
+        best = quotient.argmax(axis=0)
+        low = angles[np.maximum(best - 1, 0), rows]
+        high = angles[np.minimum(best + 1, _ANGLES - 1), rows]
+    return tx[best, rows], ty[best, rows]

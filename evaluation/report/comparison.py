@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from slipcar.evaluation import learning
 from slipcar.evaluation.cells import controller_fingerprint
 from slipcar.evaluation.report.document import (
-    NONE,
     Column,
     Document,
     Figure,
@@ -22,6 +21,13 @@ from slipcar.evaluation.report.document import (
     table_of,
     write_texts,
 )
+from slipcar.evaluation.report.formats import (
+    collisions,
+    difference,
+    duration,
+    number,
+    with_error,
+)
 from slipcar.evaluation.runs import Runs
 
 if TYPE_CHECKING:
@@ -29,51 +35,6 @@ if TYPE_CHECKING:
     from rich.console import Group
 
     from slipcar.evaluation.compare import Comparison
-
-
-def with_error(key: str) -> Callable[[Any], str]:
-    """Text of a mean and its standard error."""
-    return lambda row: f"{row[key]:.3f} ± {row[f'{key}_se']:.3f}"
-
-
-def collisions(digits: int, key: str = "collision") -> Callable[[Any], str]:
-    """Text of a rate of collisions and its interval, in percent."""
-
-    def text(row: Any) -> str:
-        rate, low, high = (100 * row[f"{key}_{part}"] for part in ("rate", "low", "high"))
-        return f"{rate:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
-
-    return text
-
-
-def _difference(key: str, scale: float, digits: int) -> Callable[[Any], str]:
-    def text(row: Any) -> str:
-        mean, low, high = (scale * row[f"{key}{part}"] for part in ("", "_low", "_high"))
-        return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
-
-    return text
-
-
-def number(key: str, digits: int, scale: float = 1.0) -> Callable[[Any], str]:
-    """Text of a number."""
-    # + 0.0: no "-0.000"
-    return lambda row: f"{round(scale * row[key], digits) + 0.0:.{digits}f}"
-
-
-def duration(key: str) -> Callable[[Any], str]:
-    """Text of seconds, in the unit that suits them."""
-
-    def text(row: Any) -> str:
-        seconds = row[key]
-        for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-            if seconds >= size:
-                return f"{seconds / size:.3g} {unit}"
-        if seconds != seconds:
-            return NONE
-        return f"{seconds / 1e-9:.3g} ns" if seconds > 0.0 else "0 s"
-
-    return text
-
 
 LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
 TOTAL = Column("total cost", with_error("total"), "total")
@@ -93,15 +54,15 @@ BETWEEN = (
 )
 DIFFERENCE = (
     LOOP,
-    Column("Δ total cost", _difference("total_difference", 1.0, 3), value="total_difference"),
+    Column("Δ total cost", difference("total_difference", 1.0, 3), value="total_difference"),
     Column(
         "Δ collisions [% points]",
-        _difference("collision_difference", 100.0, 2),
+        difference("collision_difference", 100.0, 2),
         value="collision_difference",
     ),
     Column(
         "at or between nodes",
-        _difference("between_difference", 100.0, 2),
+        difference("between_difference", 100.0, 2),
         value="between_difference",
     ),
 )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,6 +97,7 @@ class Column:
         sign: see `best`.
         marked: the key that says of each row whether it is emphasised, or None.
         value: the key of the number to sort by; None takes `best`, and the text if that is None.
+        among: the key that says of each row whether it may be the best; None lets all.
     """
 
     header: str
@@ -104,6 +106,7 @@ class Column:
     sign: int = 1
     marked: str | None = None
     value: str | None = None
+    among: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +193,7 @@ def table_of(frame: pd.DataFrame, caption: str, columns: tuple[Column, ...]) -> 
 
     The best of a column, or those marked, are emphasised; rows that print the same as the best are
     emphasised with it. A row whose `error` (if the frame has that column) is not empty prints
-    nothing else than its name.
+    nothing else than its name, and where a number is nan there is none.
     """
     rows = [row for _, row in frame.iterrows()]
     failed = [bool(row["error"]) if "error" in frame else False for row in rows]
@@ -201,13 +204,20 @@ def table_of(frame: pd.DataFrame, caption: str, columns: tuple[Column, ...]) -> 
         printed = [
             NONE if fails else column.text(row) for fails, row in zip(failed, rows, strict=True)
         ]
-        printed = [NONE if "nan" in text else text for text in printed]
-        if column.best is not None and sum(text != NONE for text in printed) > 1:
-            best = printed[int(np.nanargmin(column.sign * frame[column.best].astype(float)))]
-            bold |= {(i, j) for i, text in enumerate(printed) if text == best}
-        if column.marked is not None:
-            bold |= {(i, j) for i, mark in enumerate(frame[column.marked].eq(True)) if mark}
         key = column.value or column.best
+        if key is not None:
+            printed = [NONE if re.search(r"\bnan\b", text) else text for text in printed]
+        there = [i for i, text in enumerate(printed) if text != NONE]
+        if column.best is not None:
+            rivals = [i for i in there if column.among is None or rows[i][column.among]]
+            rank = {i: column.sign * float(rows[i][column.best]) for i in rivals}
+            rank = {i: number for i, number in rank.items() if not math.isnan(number)}
+            if len(rank) > 1:
+                best = printed[min(rank, key=rank.__getitem__)]
+                bold |= {(i, j) for i in rank if printed[i] == best}
+        if column.marked is not None:
+            marks = list(frame[column.marked].eq(True))
+            bold |= {(i, j) for i in there if marks[i]}
         texts.append(tuple(printed))
         numbers.append(
             tuple(
@@ -264,16 +274,43 @@ def from_json(text: str) -> Document:
         )
     try:
         return Document(
-            **{key: str(data[key]) for key in ("kind", "title", "setting")},
-            notes=tuple(str(note) for note in data["notes"]),
+            **{key: _typed(key, data[key], str) for key in ("kind", "title", "setting")},
+            notes=tuple(_typed("note", note, str) for note in _typed("notes", data["notes"], list)),
             tables=tuple(_table_from_dict(table) for table in data["tables"]),
-            figures=tuple(Figure(**figure) for figure in data["figures"]),
-            frames={name: _frame_from_dict(frame) for name, frame in data["frames"].items()},
-            provenance=dict(data["provenance"]),
-            scene=data["scene"],
+            figures=tuple(
+                Figure(_file_name(figure["stem"]), _typed("caption", figure["caption"], str))
+                for figure in data["figures"]
+            ),
+            frames={
+                _file_name(name): _frame_from_dict(frame) for name, frame in data["frames"].items()
+            },
+            provenance=_provenance(data["provenance"]),
+            scene=None if data["scene"] is None else _typed("scene", data["scene"], dict),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"is damaged: {type(error).__name__}: {error}") from error
+
+
+def _typed(what: str, value: Any, *types: type) -> Any:
+    if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
+        wanted = " or ".join(kind.__name__ for kind in types)
+        raise TypeError(f"{what} must be {wanted}, not {value!r:.80}")
+    return value
+
+
+def _file_name(name: Any) -> str:
+    """A report writes and reads files that are called so: none may lie elsewhere."""
+    if not re.fullmatch(r"\w[^/\\:\x00-\x1f]*", _typed("name", name, str)):
+        raise ValueError(f"a frame or figure must be named like a file, not {name!r:.80}")
+    return str(name)
+
+
+def _provenance(data: Any) -> dict[str, Any]:
+    """Facts of any names; those that renderings take apart are what these take them for."""
+    found = dict(_typed("provenance", data, dict))
+    _typed("versions", found.get("versions") or {}, dict)
+    _typed("commit", found.get("commit") or "", str)
+    return found
 
 
 def _table_to_dict(table: Table) -> dict[str, Any]:
@@ -282,10 +319,13 @@ def _table_to_dict(table: Table) -> dict[str, Any]:
 
 def _table_from_dict(data: dict[str, Any]) -> Table:
     return Table(
-        caption=data["caption"],
-        headers=tuple(data["headers"]),
-        cells=tuple(map(tuple, data["cells"])),
-        values=tuple(map(tuple, data["values"])),
+        caption=_typed("caption", data["caption"], str),
+        headers=tuple(_typed("header", header, str) for header in data["headers"]),
+        cells=tuple(tuple(_typed("cell", cell, str) for cell in row) for row in data["cells"]),
+        values=tuple(
+            tuple(_typed("value", value, float, int, type(None)) for value in row)
+            for row in data["values"]
+        ),
         bold=frozenset((int(i), int(j)) for i, j in data["bold"]),
     )
 

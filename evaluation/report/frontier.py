@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from slipcar.evaluation.frontier import CURVES, RECEDING
 from slipcar.evaluation.report import comparison as report
 from slipcar.evaluation.report.document import Column, Document, table_of, write_texts
+from slipcar.evaluation.report.formats import collisions, with_error
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -16,9 +17,9 @@ if TYPE_CHECKING:
 
 COLUMNS = (
     report.LOOP,
-    Column("collisions [%]", report.collisions(3), value="collision_rate"),
-    Column("effort", report.with_error("effort"), marked="effort_front", value="effort"),
-    Column("total cost", report.with_error("total"), marked="total_front", value="total"),
+    Column("collisions [%]", collisions(3), value="collision_rate"),
+    Column("effort", with_error("effort"), marked="effort_front", value="effort"),
+    Column("total cost", with_error("total"), marked="total_front", value="total"),
 )
 TABLES = (
     (

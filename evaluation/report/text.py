@@ -61,13 +61,21 @@ def csv_table(table: Table) -> str:
 
 
 def prose(text: str) -> str:
-    """A paragraph in Markdown: names in it begin no tag."""
-    return re.sub(r"<(?=[A-Za-z/!?])", r"\<", text)
+    """One paragraph in Markdown: it begins no heading, list or table, names in it no tag."""
+    line = re.sub(r"<(?=[A-Za-z/!?])", r"\<", " ".join(text.split()))
+    line = re.sub(r"^(?=[#>|=~+-])", r"\\", line)
+    return re.sub(r"^(\d+)(?=[.)](?: |$))", r"\1\\", line)
 
 
 def _markdown(text: str) -> str:
-    """What would end a cell or begin a tag is escaped."""
-    return re.sub(r"([\\|<*`])", r"\\\1", " ".join(text.split()))
+    """What would end a cell, or begin a tag, a link or emphasis, is escaped.
+
+    An underscore within or behind a word begins no emphasis, a bracket that no parenthesis follows
+    no link: they stay as they are.
+    """
+    special = r"[\\|<*`~]|(?<!\w)_+|\](?=\()|&(?=#?\w+;)"
+    line = " ".join(text.split())
+    return re.sub(special, lambda found: "".join(rf"\{letter}" for letter in found[0]), line)
 
 
 def latex(document: Document) -> str:

@@ -137,7 +137,8 @@ def covariance_table(r: Reproduction) -> Table:
     rows, values = [], []
     for name, covariance in covariances(r).items():
         numbers = _spread(r, covariance)
-        ratio = numbers[0] / r.moments.variance[0]
+        measured = r.moments.variance[0]
+        ratio = numbers[0] / measured if measured > 0.0 else math.nan  # a single path has none
         texts = (f"{numbers[0]:.5f}", f"{ratio:.3f}", *(f"{value:.4f}" for value in numbers[1:]))
         rows.append((name, *texts))
         values.append((None, numbers[0], ratio, *numbers[1:]))

@@ -23,15 +23,20 @@ def touched(scenario, a, b, speed):
 
 
 def sampled(a, b, deviation, steps=1000, paths=20_000):
-    """Share of bridges from a to b that enter the disc (Broadie's shift for the time grid)."""
+    """Share of bridges from a to b that enter the disc (Broadie's shift for the time grid).
+
+    `deviation` of the noise is one number, or one for x and one for y.
+    """
     rng = np.random.default_rng(0)
     x, hit, dt = np.tile(np.asarray(a, float), (paths, 1)), np.zeros(paths, bool), H / steps
-    radius = RADIUS + 0.5826 * deviation * np.sqrt(dt)
+    deviation = np.broadcast_to(deviation, 2)
     for j in range(steps - 1):
         left = H - j * dt
         x = x + (b - x) * dt / left
         x += deviation * np.sqrt(dt * (left - dt) / left) * rng.normal(size=x.shape)
-        hit |= np.hypot(*x.T) < radius
+        distance = np.hypot(*x.T)
+        across = np.hypot(*(x * deviation).T) / distance  # the noise towards the rim
+        hit |= distance < RADIUS + 0.5826 * across * np.sqrt(dt)
     return hit.mean()
 
 
@@ -48,8 +53,7 @@ def test_the_probability_is_that_of_sampled_bridges(disc, a, b, speed):
     expected = sampled(a, b, 0.1 * speed)
     error = np.sqrt(expected * (1.0 - expected) / 20_000)
     found = touched(disc, a, b, speed)
-    assert found >= expected - 3.0 * error  # if anything, on the safe side
-    assert found == pytest.approx(expected, rel=0.2, abs=3.0 * error)
+    assert found == pytest.approx(expected, rel=0.1, abs=3.0 * error)
 
 
 def test_without_noise_the_path_is_the_chord(disc):
@@ -60,7 +64,34 @@ def test_without_noise_the_path_is_the_chord(disc):
 def test_process_noise_counts(disc):
     noisy = disc.replace(process_noise=(0.1, 0.1, 0, 0, 0))
     still = [(-0.1, 0.3), (0.1, 0.3)]
-    assert touched(noisy, *still, 0.0) == pytest.approx(touched(disc, *still, 1.0), rel=1e-12)
+    assert touched(noisy, *still, 0.0) == pytest.approx(touched(disc, *still, 1.0), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "noise"),
+    [
+        ((-0.1, 0.3), (0.1, 0.3), (0.02, 0.2)),  # towards the rim
+        ((0.2, 0.25), (0.28, 0.15), (0.2, 0.03)),  # askew
+        ((0.2, 0.25), (0.28, 0.15), (0.05, 0.4)),
+        ((0.25, 0.27), (0.44, 0.25), (0.6, 0.06)),  # along the rim most of all
+    ],
+)
+def test_noise_may_depend_on_direction(disc, a, b, noise):
+    expected = sampled(a, b, noise)
+    error = np.sqrt(expected * (1.0 - expected) / 20_000)
+    found = touched(disc.replace(process_noise=(*noise, 0, 0, 0)), a, b, 0.0)
+    assert 0.001 < expected < 0.5
+    assert found == pytest.approx(expected, rel=0.2, abs=3.0 * error)
+
+
+def test_noise_that_hardly_depends_on_direction_is_as_good_as_any(disc):
+    a, b = (0.3, -0.05), (0.4, 0.1)
+    even, uneven = (
+        touched(disc.replace(process_noise=(0.2, y, 0, 0, 0)), a, b, 0.0) for y in (0.2, 0.2 + 1e-9)
+    )
+    assert uneven == pytest.approx(even, rel=1e-6)
+    along = disc.replace(process_noise=(0.2, 0.0, 0, 0, 0))
+    assert touched(along, (-0.1, 0.3), (0.1, 0.3), 0.0) == 0.0  # it never leaves y = 0.3
 
 
 def test_it_turns_with_the_world(disc):

@@ -77,6 +77,29 @@ def test_marked_cells_are_emphasised(frame):
     assert [row[1] for row in table.values] == [1.0, 2.0, 3.0, None]
 
 
+def test_what_is_not_there_is_not_emphasised(frame):
+    column = Column("cost", COST.text, marked="dear", value="cost")
+    table = table_of(frame.assign(dear=[True, False, False, True], error=""), "", (column,))
+    assert table.cells[3] == ("d", "–")
+    assert table.bold == {(0, 1)}
+
+
+def test_only_rivals_are_compared(frame):
+    column = Column("cost", COST.text, "cost", among="fair")
+    table = table_of(frame.assign(fair=[True, True, False, True]), "", (column,))
+    assert table.bold == {(1, 1)}  # and not "c", which prints the same
+    alone = table_of(frame.assign(fair=[False, False, True, True]), "", (column,))
+    assert alone.bold == frozenset()
+
+
+def test_nan_is_a_number_and_not_a_part_of_a_word(frame):
+    word = Column("who", lambda row: "finance" if row.name == "a" else "nan")
+    number = Column("x", lambda row: f"{row['cost']:.1f} in Ghanaian", value="cost")
+    table = table_of(frame.assign(error=""), "", (word, number))
+    assert [row[1] for row in table.cells] == ["finance", "nan", "nan", "nan"]
+    assert [row[2] for row in table.cells][2:] == ["1.0 in Ghanaian", "–"]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -148,12 +171,23 @@ def test_another_format_is_named(document, tmp_path):
         lambda text: text.replace('"title"', '"tittle"'),
         lambda text: text.replace('"dtype": "float64"', '"dtype": "float6"'),
         lambda text: text.replace('"stem"', '"root"'),
+        lambda text: text.replace('"stem": "shape"', '"stem": "../shape"'),
+        lambda text: text.replace('"times": {', '"../times": {'),
+        lambda text: text.replace('"times": {', '"/tmp/times": {'),
+        lambda text: text.replace('"provenance": {"cpu"', '"provenance": [], "x": {"cpu"'),
+        lambda text: text.replace('"versions": {"numpy": "2"}', '"versions": "2"'),
+        lambda text: text.replace('"commit": "', '"commit": 1, "x": "'),
+        lambda text: text.replace('"notes": ["', '"notes": "d did", "x": ["'),
+        lambda text: text.replace('"cells": [["a"', '"cells": [[1'),
+        lambda text: text.replace('"values": [[null, 3.0', '"values": [[null, "3"'),
     ],
 )
 def test_a_damaged_file_is_named(document, tmp_path, damage):
     document.save(tmp_path)
     path = tmp_path / "document.json"
-    path.write_text(damage(path.read_text(encoding="utf-8")), encoding="utf-8")
+    whole = path.read_text(encoding="utf-8")
+    path.write_text(damage(whole), encoding="utf-8")
+    assert path.read_text(encoding="utf-8") != whole
     with pytest.raises(ValueError, match=re.escape(str(path))):
         read_document(tmp_path)
 
@@ -193,7 +227,9 @@ def named(name):
     return Table("100 % of a_b", ("who", "x"), ((name, "1"),), ((None, 1.0),))
 
 
-@pytest.mark.parametrize("name", ["a|b", "a\nb", "<script>x</script>", "2 * 3 * 4", "back\\slash"])
+@pytest.mark.parametrize(
+    "name", ["a|b", "a\nb", "<script>x</script>", "2 * 3 * 4", "back\\slash", "_x_"]
+)
 def test_names_cannot_break_markdown_tables(document, name):
     import dataclasses
 
@@ -209,6 +245,34 @@ def test_text_begins_no_tag_in_markdown(document):
     evil = "<b>x</b> at 1 < 2"
     changed = dataclasses.replace(document, setting=evil, notes=(evil,))
     assert changed.markdown().count(r"\<b>x\</b> at 1 < 2") == 2
+
+
+def test_text_is_one_paragraph_in_markdown(document):
+    import dataclasses
+
+    evil = "boom\n# A heading\n\n| a | b |\n|---|---|\n| 1 | 2 |"
+    text = dataclasses.replace(document, notes=(evil,), setting="# no\n# heading").markdown()
+    assert "boom # A heading | a | b |" in text
+    assert not any(line.startswith("#") for line in text.splitlines())
+    assert len(rows_of(text)) == len(rows_of(document.markdown()))
+    listed = dataclasses.replace(document, notes=("1. a", "- b", "2.5 m", "> c")).markdown()
+    for told in (r"1\. a", r"\- b", "2.5 m", r"\> c"):
+        assert f"\n{told}\n" in listed
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("_x_ Δ_{k+1}", r"\_x_ Δ_{k+1}"),
+        ("total_p95 of __init__", r"total_p95 of \_\_init__"),
+        ("[a](b) [1.0, 2.0]", r"[a\](b) [1.0, 2.0]"),
+        ("~a~ &lt; a & b", r"\~a\~ \&lt; a & b"),
+    ],
+)
+def test_markdown_takes_cells_as_text(name, expected):
+    from slipcar.evaluation.report.text import markdown_table
+
+    assert rows_of(markdown_table(named(name)))[2][0] == expected
 
 
 def tabulars(text):

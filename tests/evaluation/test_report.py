@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from slipcar.evaluation import compare, sample_paths
-from slipcar.evaluation.report.comparison import TAILS, document, duration, save, save_document
+from slipcar.evaluation.report.comparison import TAILS, document, save, save_document
 from slipcar.evaluation.report.document import Figure, read_document
+from slipcar.evaluation.report.formats import duration, with_error, with_interval
 from slipcar.evaluation.report.scene import scene
 from slipcar.evaluation.runs import Runs
 from slipcar.planner import Feedback, OpenLoop, plan
@@ -248,3 +249,13 @@ def test_of_many_rows_a_few_are_shown_at_first(paper, replay, turning):
         rows[name].closed_loop = True
     shown = scene(compare(rows, paper, 20, reference="r1", progress=False))
     assert [row["name"] for row in shown["rows"] if row["shown"]] == ["r1", "r3", "r4"]
+
+
+def test_what_has_no_error_prints_the_mean_alone():
+    row = {"cost": 1.25, "cost_se": 0.5, "cost_low": -0.5, "cost_high": 2.0}
+    single = {"cost": 1.25, **dict.fromkeys(("cost_se", "cost_low", "cost_high"), float("nan"))}
+    assert with_error("cost")(row) == "1.250 ± 0.500"
+    assert with_error("cost")(single) == "1.250"
+    text = with_interval("cost", "cost", 10.0, 1, "+")
+    assert text(row) == "+12.5 [-5.0, +20.0]"
+    assert text(single) == "+12.5"

@@ -1,5 +1,6 @@
 """`slipcar reproduce`: every claim has a verdict, and a line that gives its number again."""
 
+import dataclasses
 import json
 import re
 
@@ -19,7 +20,7 @@ from slipcar.evaluation.reproduction.claims import (
 )
 from slipcar.evaluation.reproduction.discrepancies import discrepancies
 from slipcar.evaluation.reproduction.reproduce import reproduce
-from slipcar.evaluation.reproduction.runs import PLANS, reference_file
+from slipcar.evaluation.reproduction.runs import PLANS, path_moments, reference_file
 from slipcar.planner import plan
 
 EPISODES = 4000
@@ -52,6 +53,14 @@ def test_verdicts(told):
     assert found[DIFFERS] == {"6.4 IPOPT", "6.4 iterations"}
     assert "6.4 collisions" in found[REPRODUCED]
     assert "6.4 p⁰ ≠ 0" in found[REPRODUCED]
+
+
+def test_a_single_path_shows_nothing_about_how_paths_differ(done):
+    moments = path_moments(done.runs["ours"].plan, done.scenario, 1)
+    few = dataclasses.replace(done, episodes=1, moments=moments)
+    verdicts = {claim.name: claim.verdict for claim in claims(few)}
+    for name in ("6.1 certain part", "6.2 moments", "6.3 uncertainty"):
+        assert verdicts[name] == NOT_RUN
 
 
 def test_every_line_gives_its_number_again(done, told, space):

@@ -8,6 +8,7 @@ import pytest
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
 from slipcar.evaluation.makers import Maker
+from slipcar.evaluation.statistics import wilson_interval
 from slipcar.evaluation.suites import horizon as suite_horizon
 from slipcar.evaluation.suites import random as suite_random
 from slipcar.evaluation.suites import slip as suite_slip
@@ -97,6 +98,60 @@ def test_worlds_are_the_unit_of_the_random_suite():
     assert "4 held-out worlds" in document.markdown()
     with pytest.raises(ValueError, match="count must be between 1 and 100, not 101"):
         suite_random.suite(10, worlds=101)
+
+
+def fails(scenario):
+    raise RuntimeError("no plan")
+
+
+@dataclasses.dataclass(frozen=True)
+class OnlyIn:
+    """Drives straight in one world, and gives up in others."""
+
+    goal: bytes
+
+    def __call__(self, scenario):
+        if scenario.goal.tobytes() != self.goal:
+            raise RuntimeError("hard")
+        return Maker.of("straight")(scenario)
+
+
+def of_random(rows, worlds, episodes=16):
+    suite = suite_random.suite(episodes, worlds)
+    return run_suite(dataclasses.replace(suite, rows=rows), progress=False)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("others", [{}, {"straight": Maker.of("straight")}, {"bad": fails}])
+@pytest.mark.parametrize("reference", [fails, Maker.of("straight")])
+def test_nothing_to_compare_with_is_no_difference(others, reference):
+    result = of_random({**others, suite_random.REFERENCE: reference}, worlds=2)
+    frame = suite_random.over_worlds(result)
+    differences = suite_random.document(result).tables[2]
+    compared = "straight" in others and reference is not fails
+    assert np.isfinite(frame["total_difference"]).sum() == np.isfinite(frame["cheaper"]).sum()
+    assert np.isfinite(frame["total_difference"]).sum() == compared
+    assert any("[" in cell for row in differences.cells for cell in row[2:]) == compared
+
+
+def test_who_gives_up_hard_worlds_is_not_the_best():
+    easy, reference = suite_random.suite(16, 3).variants[1].scenario, suite_random.REFERENCE
+    straight = Maker.of("straight")
+    rows = {"easy": OnlyIn(easy.goal.tobytes()), "all": straight, reference: straight}
+    table = suite_random.document(of_random(rows, worlds=3)).tables[0]
+    worlds = table.headers.index("worlds")
+    assert [row[worlds] for row in table.cells] == ["1", "3", "3"]
+    assert {row for row, _ in table.bold} == {1, 2}
+    cost = table.headers.index("total cost")
+    assert "±" not in table.cells[0][cost]  # one world has no error, but a mean
+    assert float(table.cells[0][cost]) > 0.0
+
+
+def test_no_collision_in_any_world_is_not_certainty():
+    frame = suite_random.over_worlds(of_random({"straight": Maker.of("straight")}, worlds=2))
+    line = frame.loc["straight"]
+    assert (line["collision_rate"], line["collision_low"]) == (0.0, 0.0)
+    assert line["collision_high"] == pytest.approx(wilson_interval(0.0, 32)[1])
 
 
 def test_the_fine_simulation_is_equally_fine_for_all():
