@@ -7,13 +7,15 @@ probability exp(−2 d_a d_b / (h nᵀDn)), n the normal. Of the half planes tha
 rim the one with the largest d_a d_b / nᵀDn counts; that the rim curves away from it, with radius
 δ, is worth a factor:
 
-    q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ cos²ϑ (d_a + d_b)))
+    q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ (d_a + d_b)))
 
-with ϑ the angle at which the shortest way from a to the rim to b meets n, and q = 1 where the chord
-itself enters. That factor is for the same noise in all directions; another stretches the plane to
-such a one, in which the rim is an ellipse, whose radius at n is the one that counts: δ becomes
-δ (nᵀDn)² / det D. (Laplace's method at that shortest way; Baldi 1995 has such asymptotics for
-domains in general, Gobet 2000 the half plane.) Given its nodes, a path collides with probability
+and q = 1 where the chord itself enters. That factor is for the same noise in all directions; another
+stretches the plane to such a one, in which the rim is an ellipse, whose radius at n is the one that
+counts: δ becomes δ (nᵀDn)² / det D. (Laplace's method at the shortest way from a to the rim to b;
+Baldi 1995 has such asymptotics for domains in general, Gobet 2000 the half plane.) Where that way
+meets n at an angle ϑ the first order has δ cos²ϑ in place of δ. It is left out: it is right for what
+hardly ever happens, but over whole paths it is too low (paper's plan: 8.4 % of paths, against 9.0 ±
+0.1 by fine sampling and 9.3 without it). Given its nodes, a path collides with probability
 1 − Π (1 − q) over intervals and obstacles; the mean over paths is the rate. No random number is
 drawn for it.
 """
@@ -136,40 +138,15 @@ def _touched(
     gap_a, gap_b = np.where(clear, gap_a, 0.0), np.where(clear, gap_b, 0.0)
     variance = nx * nx * variance_x + ny * ny * variance_y
     product = gap_a * gap_b
-    # a and b along the rim: d_a d_b / cos²ϑ is d_a d_b − t_a t_b, for both meet n at one angle.
-    oblique = product - (nx * ay - ny * ax) * (nx * by - ny * bx)
     if len(uneven):
-        sides = [part[uneven] for part in (nx, ny, ax, ay, bx, by, radius, variance_x, variance_y)]
-        oblique[uneven] = product[uneven] - variance[uneven] * _along(*sides)
         determinant = np.maximum(variance_x * variance_y, 1e-300)[uneven]
         radius = radius.copy()
         radius[uneven] *= variance[uneven] ** 2 / determinant
     # Without noise the path is the chord: exp(−∞).
     with np.errstate(divide="ignore", invalid="ignore"):
         straight = np.exp(-2.0 * product / variance)
-        bend = np.sqrt(1.0 + 2.0 * np.maximum(oblique, 0.0) / (radius * (gap_a + gap_b)))
+        bend = np.sqrt(1.0 + 2.0 * product / (radius * (gap_a + gap_b)))
         return np.where(clear, straight / bend, 1.0)
-
-
-def _along(
-    nx: np.ndarray,
-    ny: np.ndarray,
-    ax: np.ndarray,
-    ay: np.ndarray,
-    bx: np.ndarray,
-    by: np.ndarray,
-    radius: np.ndarray,
-    variance_x: np.ndarray,
-    variance_y: np.ndarray,
-) -> np.ndarray:
-    """Product of how far a and b lie along the rim where noise is even: stretched by D^(-1/2)."""
-    weight_x, weight_y = 1.0 / np.maximum(variance_x, 1e-300), 1.0 / np.maximum(variance_y, 1e-300)
-    tangent = ny * ny * weight_x + nx * nx * weight_y
-    a, b = (
-        nx * (y - radius * ny) * weight_y - ny * (x - radius * nx) * weight_x
-        for x, y in ((ax, ay), (bx, by))
-    )
-    return a * b / tangent
 
 
 def _turned(
