@@ -7,7 +7,8 @@ PYTHON ?= python3
 # Passed on to the command: make compare ARGS="--episodes 1000", make test ARGS="-k scenario"
 ARGS ?=
 # Processes that share the episodes of `compare` and `frontier`; the numbers do not depend on it.
-WORKERS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 1)
+# (nproc heeds OMP_NUM_THREADS, which is about threads.)
+WORKERS ?= $(shell env -u OMP_NUM_THREADS nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 1)
 # Processes that share the tests; each compiles the planner for itself where the cache is empty.
 TESTERS ?= 2
 # Options of pip for torch alone, say --index-url with the address of a CPU-only build.

@@ -9,15 +9,15 @@ rim the one with the largest d_a d_b / nᵀDn counts; that the rim curves away f
 
     q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ (d_a + d_b)))
 
-and q = 1 where the chord itself enters. That factor is for the same noise in all directions; another
-stretches the plane to such a one, in which the rim is an ellipse, whose radius at n is the one that
-counts: δ becomes δ (nᵀDn)² / det D. (Laplace's method at the shortest way from a to the rim to b;
-Baldi 1995 has such asymptotics for domains in general, Gobet 2000 the half plane.) Where that way
-meets n at an angle ϑ the first order has δ cos²ϑ in place of δ. It is left out: it is right for what
-hardly ever happens, but over whole paths it is too low (paper's plan: 8.4 % of paths, against 9.0 ±
-0.1 by fine sampling and 9.3 without it). Given its nodes, a path collides with probability
-1 − Π (1 − q) over intervals and obstacles; the mean over paths is the rate. No random number is
-drawn for it.
+and q = 1 where the chord itself enters. That factor is for the same noise in all directions;
+another stretches the plane to such a one, in which the rim is an ellipse, whose radius at n is the
+one that counts: δ becomes δ (nᵀDn)² / det D. (Laplace's method at the shortest way from a to the
+rim to b; Baldi 1995 has such asymptotics for domains in general, Gobet 2000 the half plane.) Where
+that way meets n at an angle ϑ the first order has δ cos²ϑ in place of δ. It is left out: it is
+right for what hardly ever happens, but over whole paths it makes the rate too low, and without it
+the rate errs by little on the safe side (benchmarks/between.py). Given its nodes, a path collides
+with probability 1 − Π (1 − q) over intervals and obstacles; the mean over paths is the rate. No
+random number is drawn for it.
 """
 
 from __future__ import annotations
