@@ -1,6 +1,6 @@
 """Write docs/suites.md and its pictures from what `make suites` left in results/.
 
-    make suites && python benchmarks/suites_page.py
+make suites && python benchmarks/suites_page.py
 """
 
 from __future__ import annotations
