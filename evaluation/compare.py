@@ -20,7 +20,7 @@ from slipcar.evaluation.noise import BLOCK
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts, evaluate
-from slipcar.evaluation.runs import Runs
+from slipcar.evaluation.runs import Runs, trainings
 from slipcar.evaluation.statistics import episodes_for, half_width, rate_interval
 from slipcar.evaluation.suites.suite import Row
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, message, sweep
@@ -111,14 +111,14 @@ def compare(
     store = Store(folder, resume)
     rows, unmade = _made(controllers, scenario, time_limit)
     counts = dict.fromkeys(rows, PILOT if fixed is None else fixed)
-    trained = {name: len(_trainings(controller)) for name, controller in rows.items()}
+    trained = {name: len(trainings(controller)) for name, controller in rows.items()}
 
     def jobs() -> list[Job]:
         return [
             Job(name, label, one, scenario, counts[name], seed, substeps, time_limit)
             for name, controller in rows.items()
             if name in counts
-            for label, one in _trainings(controller).items()
+            for label, one in trainings(controller).items()
         ]
 
     def expected() -> dict[str, int]:
@@ -141,7 +141,7 @@ def compare(
     reused = [
         name
         for name in results
-        if all((name, label) in part.reused for part in swept for label in _trainings(rows[name]))
+        if all((name, label) in part.reused for part in swept for label in trainings(rows[name]))
     ]
     computed = sum(part.computed for part in swept)
     if folder is not None and resume and computed and (others := store.foreign()):
@@ -200,13 +200,6 @@ def needed(resolution: float, row: Result) -> int:
     return min(MOST, max(PILOT, -(-episodes_for(resolution, rate) // BLOCK) * BLOCK))
 
 
-def _trainings(controller: Controller | Runs) -> dict[str, Controller]:
-    """Label -> controller of everything behind a row."""
-    if isinstance(controller, Runs):
-        return dict(zip(controller.labels, controller.controllers, strict=True))
-    return {"": controller}
-
-
 def _rows(
     controllers: Mapping[str, Controller | Runs], swept: Swept
 ) -> tuple[dict[str, Result], dict[str, str]]:
@@ -214,7 +207,7 @@ def _rows(
     results: dict[str, Result] = {}
     errors: dict[str, str] = {}
     for name, controller in controllers.items():
-        labels = _trainings(controller)
+        labels = trainings(controller)
         failed = [swept.errors[name, label] for label in labels if (name, label) in swept.errors]
         if failed:
             errors[name] = failed[0]

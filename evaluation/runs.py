@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Sequence
+from typing import Any
 
 from slipcar.evaluation.controller import Controller, check_controller
 
@@ -51,3 +52,10 @@ class Runs:
         if None in told:
             return None
         return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+
+
+def trainings(row: Any) -> dict[str, Any]:
+    """Label -> controller of everything behind a row; a single one has no label."""
+    if isinstance(row, Runs):
+        return dict(zip(row.labels, row.controllers, strict=True))
+    return {"": row}

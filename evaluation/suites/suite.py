@@ -26,7 +26,7 @@ from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts
-from slipcar.evaluation.runs import Runs
+from slipcar.evaluation.runs import Runs, trainings
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, sweep
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def run_suite(
         )
         for row, controller in suite.rows.items()
         for variant in suite.variants
-        for label, one in _trainings(controller).items()
+        for label, one in trainings(controller).items()
     ]
     totals: dict[str, int] = {}
     for job in jobs:
@@ -205,7 +205,7 @@ def run_suite(
     results, errors = {}, {}
     for row, controller in suite.rows.items():
         for variant in suite.variants:
-            names = [(row, f"{variant.label}\n{label}") for label in _trainings(controller)]
+            names = [(row, f"{variant.label}\n{label}") for label in trainings(controller)]
             failed = [swept.errors[name] for name in names if name in swept.errors]
             if failed:
                 errors[row, variant.label] = failed[0]
@@ -223,13 +223,6 @@ def run_suite(
         wall_time=time.perf_counter() - began,
         provenance=provenance(),
     )
-
-
-def _trainings(controller: Row) -> dict[str, Any]:
-    """Label -> controller of everything behind a row."""
-    if isinstance(controller, Runs):
-        return dict(zip(controller.labels, controller.controllers, strict=True))
-    return {"": controller}
 
 
 def save_suite(
