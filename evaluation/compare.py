@@ -22,8 +22,7 @@ from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts, evaluate
 from slipcar.evaluation.runs import Runs, trainings
 from slipcar.evaluation.statistics import episodes_for, half_width, rate_interval
-from slipcar.evaluation.suites.suite import Row
-from slipcar.evaluation.sweep import TIME_LIMIT, Job, Swept, message, sweep
+from slipcar.evaluation.sweep import TIME_LIMIT, Job, Row, Swept, message, sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -115,7 +114,7 @@ def compare(
 
     def jobs() -> list[Job]:
         return [
-            Job(name, label, one, scenario, counts[name], seed, substeps, time_limit)
+            Job(name, "", label, one, scenario, counts[name], seed, substeps, time_limit)
             for name, controller in rows.items()
             if name in counts
             for label, one in trainings(controller).items()
@@ -141,7 +140,9 @@ def compare(
     reused = [
         name
         for name in results
-        if all((name, label) in part.reused for part in swept for label in trainings(rows[name]))
+        if all(
+            (name, "", label) in part.reused for part in swept for label in trainings(rows[name])
+        )
     ]
     computed = sum(part.computed for part in swept)
     if folder is not None and resume and computed and (others := store.foreign()):
@@ -203,18 +204,10 @@ def needed(resolution: float, row: Result) -> int:
 def _rows(
     controllers: Mapping[str, Controller | Runs], swept: Swept
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """Results and errors by row; a row of several trainings fails with any of them."""
-    results: dict[str, Result] = {}
-    errors: dict[str, str] = {}
-    for name, controller in controllers.items():
-        labels = trainings(controller)
-        failed = [swept.errors[name, label] for label in labels if (name, label) in swept.errors]
-        if failed:
-            errors[name] = failed[0]
-            continue
-        parts = [swept.results[name, label] for label in labels]
-        results[name] = Result.of_runs(parts) if isinstance(controller, Runs) else parts[0]
-    return results, errors
+    """Results and errors by row."""
+    found = {name: swept.row(name, controller) for name, controller in controllers.items()}
+    results = {name: row for name, row in found.items() if isinstance(row, Result)}
+    return results, {name: row for name, row in found.items() if isinstance(row, str)}
 
 
 def _too_wide(results: dict[str, Result], resolution: float) -> list[str]:

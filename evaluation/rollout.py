@@ -98,7 +98,7 @@ def evaluate(
         >>> r.collision_rate, r.collision_interval, r.total, r.total_se
 
     The result is the same, bit for bit, for any `batch_size` and `n_jobs`; memory holds the
-    per-episode metrics (72 bytes an episode) and one block.
+    per-episode metrics (73 bytes an episode) and one block.
 
     Args:
         controller: any object with the `predict` of Stable-Baselines3; see

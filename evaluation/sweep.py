@@ -14,13 +14,22 @@ from typing import Any
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.cells import Store, cell_key, cell_size, controller_fingerprint
 from slipcar.evaluation.controller import Controller
-from slipcar.evaluation.executors import Executor, Outcome, run
+from slipcar.evaluation.executors import Executor, run
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.rollout import Measured, Stretch, joined, measure
+from slipcar.evaluation.runs import Runs, trainings
 
 #: Seconds that 1024 episodes of a row may take; a hundred times what a receding horizon needs.
 TIME_LIMIT = 300.0
+
+
+#: What a row may be: a function of the scenario that makes its controller (a
+#: :class:`slipcar.evaluation.makers.Maker`, or a user's own); or brought along, once or in several
+#: trainings.
+Row = Callable[[Scenario], Controller] | Controller | Runs
+#: Of a job: row, variant, training.
+Name = tuple[str, str, str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +38,8 @@ class Job:
 
     Attributes:
         row: name of the row, and of the progress bar.
-        variant: which world, or which training, of several in a row.
+        variant: which world, of several; empty where there is one.
+        training: which of several trainings of a learned row; empty where there is one.
         controller: who drives; or a function of the scenario that makes it, with `fingerprint()`
             if finished work is to be reused: then workers plan.
         scenario: where.
@@ -41,6 +51,7 @@ class Job:
 
     row: str
     variant: str
+    training: str
     controller: Controller | Callable[[Scenario], Controller]
     scenario: Scenario
     episodes: int
@@ -49,9 +60,9 @@ class Job:
     time_limit: float | None = TIME_LIMIT
 
     @property
-    def name(self) -> tuple[str, str]:
-        """Row and variant."""
-        return self.row, self.variant
+    def name(self) -> Name:
+        """Row, variant and training."""
+        return self.row, self.variant, self.training
 
     def stretches(self) -> list[Stretch]:
         """Its episodes in cells; a controller that is made in the worker is made only once."""
@@ -76,23 +87,33 @@ class Swept:
     """What came of jobs.
 
     Attributes:
-        results: (row, variant) -> result, of the jobs that finished.
-        errors: (row, variant) -> message, of those that raised.
+        results: name of the job -> result, of those that finished.
+        errors: name -> message, of those that raised.
         reused: jobs of which every cell was there before.
         computed: cells that were computed.
     """
 
-    results: dict[tuple[str, str], Result]
-    errors: dict[tuple[str, str], str]
-    reused: frozenset[tuple[str, str]]
+    results: dict[Name, Result]
+    errors: dict[Name, str]
+    reused: frozenset[Name]
     computed: int
+
+    def row(self, row: str, controller: Row, variant: str = "") -> Result | str:
+        """A row in a variant, all its trainings together; or what the first that failed said."""
+        names = [(row, variant, training) for training in trainings(controller)]
+        failed = next((self.errors[name] for name in names if name in self.errors), None)
+        return failed or Result.of_runs([self.results[name] for name in names])
+
+    def stored(self, row: str, controller: Row, variant: str = "") -> bool:
+        """Whether all of such a row was there before."""
+        return all((row, variant, training) in self.reused for training in trainings(controller))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Piece:
     """A cell of a job, on its way through the workers."""
 
-    job: tuple[str, str]
+    job: Name
     index: int
     key: dict[str, Any] | None
     stretch: Stretch
@@ -106,9 +127,9 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
     Raises:
         LostWorkersError: if the cluster is gone; what was finished is in the store.
     """
-    done: dict[tuple[str, str], dict[int, Measured]] = {job.name: {} for job in jobs}
-    counts: dict[tuple[str, str], int] = {}
-    failed: dict[tuple[str, str], dict[int, str]] = {}
+    done: dict[Name, dict[int, Measured]] = {job.name: {} for job in jobs}
+    counts: dict[Name, int] = {}
+    failed: dict[Name, dict[int, str]] = {}
     missing: list[_Piece] = []
     for job in jobs:
         stretches = job.stretches()
@@ -130,8 +151,8 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
                 yield piece
 
     computed = 0
-    for piece, measured, error in _computed(wanted(), executor):
-        row, _ = piece.job
+    for piece, measured, error in run(_measured, wanted(), executor):
+        row, *_ = piece.job
         if error is not None:
             failed.setdefault(piece.job, {})[piece.index] = message(error)
             bars.note(row, "failed")
@@ -153,10 +174,6 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
         if job.name not in errors
     }
     return Swept(results, errors, reused, computed)
-
-
-def _computed(pieces: Iterator[_Piece], executor: Executor) -> Iterator[Outcome]:
-    return run(_measured, pieces, executor)
 
 
 def _measured(piece: _Piece) -> Measured:

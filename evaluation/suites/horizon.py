@@ -54,7 +54,7 @@ def suite(episodes: int = EPISODES, nodes: tuple[int, ...] = NODES) -> Suite:
         variants.append(Variant(f"N = {count}, own grid", float(count), world))
         substeps = FINE // (count - 1)
         variants.append(Variant(f"N = {count}, fine", float(count), world, substeps))
-    return Suite("horizon", "nodes", rows, variants, episodes, REFERENCE)
+    return Suite("horizon", rows, variants, episodes, REFERENCE)
 
 
 def document(result: SuiteResult) -> Document:

@@ -59,7 +59,7 @@ def suite(episodes: int = EPISODES, worlds: int = WORLDS) -> Suite:
         Variant(f"world {number}", float(number), scenario)
         for number, scenario in enumerate(held_out)
     ]
-    return Suite("random", "world", rows, variants, episodes, REFERENCE)
+    return Suite("random", rows, variants, episodes, REFERENCE)
 
 
 def document(result: SuiteResult) -> Document:

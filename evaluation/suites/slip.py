@@ -54,7 +54,7 @@ def suite(episodes: int = EPISODES, slips: tuple[float, ...] = SLIPS) -> Suite:
         Variant(f"α² = {slip:g}", float(slip), paper.replace(slip=(slip, 0.1 * slip)))
         for slip in sorted(slips)
     ]
-    return Suite("slip", "α²", rows, variants, episodes, REFERENCE)
+    return Suite("slip", rows, variants, episodes, REFERENCE)
 
 
 def document(result: SuiteResult) -> Document:

@@ -14,30 +14,25 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.cells import Store
-from slipcar.evaluation.controller import Controller
 from slipcar.evaluation.executors import open_executor
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import check_counts
-from slipcar.evaluation.runs import Runs, trainings
-from slipcar.evaluation.sweep import TIME_LIMIT, Job, sweep
+from slipcar.evaluation.runs import trainings
+from slipcar.evaluation.sweep import TIME_LIMIT, Job, Row, sweep
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from slipcar.evaluation.report.document import Document
 
-#: What a row may be: a function of the scenario that makes its controller, called by a worker for
-#: each world (a :class:`slipcar.evaluation.makers.Maker`, or a user's own); or brought along, once
-#: or in several trainings.
-Row = Callable[[Scenario], Controller] | Controller | Runs
 #: Columns that differ from run to run: they go to a file of their own.
 TIMES = ("inference_time", "preparation_time")
 
@@ -65,7 +60,6 @@ class Suite:
 
     Attributes:
         name: "random", "slip", "horizon".
-        varied: what varies from variant to variant, with its unit.
         rows: by name, in the order of the tables.
         variants: in order.
         episodes: of each row in each variant.
@@ -74,7 +68,6 @@ class Suite:
     """
 
     name: str
-    varied: str
     rows: Mapping[str, Row]
     variants: Sequence[Variant]
     episodes: int
@@ -185,7 +178,8 @@ def run_suite(
     jobs = [
         Job(
             row=row,
-            variant=f"{variant.label}\n{label}",
+            variant=variant.label,
+            training=label,
             controller=one,
             scenario=variant.scenario,
             episodes=suite.episodes,
@@ -202,22 +196,16 @@ def run_suite(
         totals[job.row] = totals.get(job.row, 0) + job.episodes
     with open_executor(n_jobs, cluster) as executor, Bars(totals, progress) as bars:
         swept = sweep(jobs, store, executor, bars)
-    results, errors = {}, {}
-    for row, controller in suite.rows.items():
-        for variant in suite.variants:
-            names = [(row, f"{variant.label}\n{label}") for label in trainings(controller)]
-            failed = [swept.errors[name] for name in names if name in swept.errors]
-            if failed:
-                errors[row, variant.label] = failed[0]
-                continue
-            parts = [swept.results[name] for name in names]
-            several = isinstance(controller, Runs)
-            results[row, variant.label] = Result.of_runs(parts) if several else parts[0]
+    found = {
+        (row, variant.label): swept.row(row, controller, variant.label)
+        for row, controller in suite.rows.items()
+        for variant in suite.variants
+    }
     return SuiteResult(
         suite=suite,
         seed=seed,
-        results=results,
-        errors=errors,
+        results={name: row for name, row in found.items() if isinstance(row, Result)},
+        errors={name: row for name, row in found.items() if isinstance(row, str)},
         computed=swept.computed,
         warnings=(store.trouble,) if store.trouble else (),
         wall_time=time.perf_counter() - began,

@@ -171,7 +171,6 @@ def test_the_fine_simulation_is_equally_fine_for_all():
 def test_a_row_that_fails_somewhere_is_told_and_the_others_go_on(paper):
     suite = Suite(
         "slip",
-        "α²",
         {"good": Maker.of("straight"), "bad": Maker.of("straight", speed="high")},
         [Variant("a", 0.0, paper), Variant("b", 1.0, paper)],
         10,
