@@ -16,7 +16,7 @@ from contenders import EXACT, Answer, Contender, UnavailableError, stopwatch
 
 from slipcar.envs import Scenario
 from slipcar.planner import Plan, Status, plan
-from slipcar.planner.backends import make_solver
+from slipcar.planner.convex.solvers import make_solver
 
 #: `plan`'s default, and one for answers as exact as those of the whole-problem solvers.
 DEFAULT_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-6
@@ -69,7 +69,7 @@ def osqp(scenario: Scenario) -> Contender:
 
 def cvxpy(scenario: Scenario) -> Contender:
     """The paper's scheme by cvxpy and Clarabel, each sub-problem written out anew."""
-    from slipcar.planner.backends.cvxpy import CvxpySolver
+    from slipcar.planner.convex.solvers.cvxpy import CvxpySolver
 
     solver = CvxpySolver().solver
     if solver != "CLARABEL":

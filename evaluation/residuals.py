@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner import plan
-from slipcar.planner.certificate import model_for, violations
-from slipcar.planner.shooting import START_WITHIN, retry_within, shoot_from
+from slipcar.planner.extremal.certificate import model_for, violations
+from slipcar.planner.extremal.shooting import START_WITHIN, retry_within, shoot_from
 
 Array = np.ndarray
 

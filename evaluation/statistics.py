@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slipcar.planner.risk import CONFIDENCE, wilson_interval
+from slipcar.planner.search.risk import CONFIDENCE, wilson_interval
 
 __all__ = [
     "CONFIDENCE",

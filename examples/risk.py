@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from slipcar.planner import Feedback, OpenLoop, Plan, plan
-from slipcar.planner.monte_carlo import violations
+from slipcar.planner.moments.monte_carlo import violations
 
 
 class Ferry:

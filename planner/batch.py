@@ -14,9 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner import checks
 from slipcar.planner.build import build
-from slipcar.planner.method import (
+from slipcar.planner.newton.functions import Functions
+from slipcar.planner.options import Options, check_count
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.plan import Plan
+from slipcar.planner.problem import checks
+from slipcar.planner.problem.model import Model, Problem, model_of
+from slipcar.planner.problem.reposed import reposed
+from slipcar.planner.search.method import (
     compiled_functions,
     driver,
     is_faithful,
@@ -25,13 +31,7 @@ from slipcar.planner.method import (
     solve,
     uses_newton,
 )
-from slipcar.planner.newton.functions import Functions
-from slipcar.planner.options import Options, check_count
-from slipcar.planner.outcome import Outcome
-from slipcar.planner.plan import Plan
-from slipcar.planner.problem import Model, Problem, model_of
-from slipcar.planner.reposed import reposed
-from slipcar.planner.warm_start import given_guess
+from slipcar.planner.search.warm_start import given_guess
 
 Array = np.ndarray
 

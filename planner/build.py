@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.moments import trace_integral
+from slipcar.planner.moments.covariance import trace_integral
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem import Model, Problem, penalty_cost
-from slipcar.planner.steering import Steering
+from slipcar.planner.problem.model import Model, Problem, penalty_cost
+from slipcar.planner.search.steering import Steering
 
 Array = np.ndarray
 

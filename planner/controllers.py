@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.control_set import control_ball, control_limits, project_controls
-from slipcar.planner.feedback import (
+from slipcar.planner.moments.gains import (
     closed_loop_covariance,
     default_tracking,
     lqr_gains,
@@ -22,7 +21,8 @@ from slipcar.planner.feedback import (
     wrap,
 )
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem import model_of
+from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
+from slipcar.planner.problem.model import model_of
 
 Array = np.ndarray
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.backends import Solver
+from slipcar.planner.convex.solvers import Solver
+from slipcar.planner.convex.trust_region import TRUST_REGIONS
 from slipcar.planner.history import Iteration
-from slipcar.planner.integrators import INTEGRATORS
-from slipcar.planner.trust_region import TRUST_REGIONS
+from slipcar.planner.problem.integrators import INTEGRATORS
 
 METHODS = ("auto", "newton", "convex")
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slipcar.planner import moments
-from slipcar.planner.convexify import Linearization
 from slipcar.planner.history import Iteration
-from slipcar.planner.problem import Model
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.problem.linearization import Linearization
+from slipcar.planner.problem.model import Model
 from slipcar.planner.status import Status
 
 Array = np.ndarray

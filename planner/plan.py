@@ -14,14 +14,14 @@ import numpy as np
 from slipcar.planner import plan_file
 from slipcar.planner.history import Iteration
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.problem import Problem
+from slipcar.planner.problem.model import Problem
 from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
-from slipcar.planner.risk import Risk
+from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
 
 if TYPE_CHECKING:
-    from slipcar.planner.certificate import Certificate
-    from slipcar.planner.shooting import Shot
+    from slipcar.planner.extremal.certificate import Certificate
+    from slipcar.planner.extremal.shooting import Shot
 
 Array = np.ndarray
 
@@ -110,7 +110,7 @@ class Plan:
                 "the certificate is of plans of the mean: leave risk, risk_price, feedback and "
                 "expected out"
             )
-        from slipcar.planner.certificate import certify
+        from slipcar.planner.extremal.certificate import certify
 
         # At its bound the horizon's slope need not vanish.
         bounds = self.options.get("final_time_bounds") or ()

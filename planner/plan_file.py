@@ -14,9 +14,9 @@ import numpy as np
 
 from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.problem import Problem
+from slipcar.planner.problem.model import Problem
 from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
-from slipcar.planner.risk import Risk
+from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
 
 if TYPE_CHECKING:

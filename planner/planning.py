@@ -9,23 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner import checks
-from slipcar.planner.backends import Solver
 from slipcar.planner.build import build, build_steered
-from slipcar.planner.free_time import checked_bounds
-from slipcar.planner.free_time import free_final_time as search_time
+from slipcar.planner.convex.solvers import Solver
 from slipcar.planner.history import Iteration
-from slipcar.planner.method import solve
 from slipcar.planner.options import Options, check_choice, check_count, check_number
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem import Problem, model_of
-from slipcar.planner.reposed import reposed
-from slipcar.planner.shot import solve_shooting
-from slipcar.planner.starts import multistart
+from slipcar.planner.problem import checks
+from slipcar.planner.problem.model import Problem, model_of
+from slipcar.planner.problem.reposed import reposed
+from slipcar.planner.search.free_time import checked_bounds
+from slipcar.planner.search.free_time import free_final_time as search_time
+from slipcar.planner.search.method import solve
+from slipcar.planner.search.shot import solve_shooting
+from slipcar.planner.search.starts import multistart
+from slipcar.planner.search.steering import Request, steer
+from slipcar.planner.search.warm_start import given_guess, run_guarded
 from slipcar.planner.status import Status
-from slipcar.planner.steering import Request, steer
-from slipcar.planner.warm_start import given_guess, run_guarded
 
 Array = np.ndarray
 
@@ -73,7 +73,7 @@ def plan(
             `risk_price`, `feedback` and `expected`, whose cost counts the noise already. Without
             one of them, w > 0 asks for a diffusion that depends on no uncertain state.
         solver: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with their interface; see
-            :mod:`slipcar.planner.backends`.
+            :mod:`slipcar.planner.convex.solvers`.
         method: `"newton"`: one LQ problem per iteration and Newton's method at the end, quadratic
             (:mod:`slipcar.planner.newton`); `"convex"`: the paper's scheme, exact convex
             sub-problems. `"auto"` takes the first unless an option or the problem asks for the
@@ -89,7 +89,7 @@ def plan(
             linearises the obstacle cost whole, as the paper writes it.
         terminal_tolerance: half-width of a box round E g = 0; 0 asks for equality.
         integrator: of the mean: `"euler"` (the paper's) or `"rk4"`; controls are constant on each
-            interval either way. See :mod:`slipcar.planner.integrators`.
+            interval either way. See :mod:`slipcar.planner.problem.integrators`.
         compiled: run Newton's method compiled by numba, the same steps to rounding errors. None:
             where numba is installed and the problem's functions can be traced, and no callback
             is to be called on the way.

@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.codegen.traced import parameter_row
 from slipcar.planner.controllers import OpenLoop
-from slipcar.planner.feedback import closed_loop_covariance, wrap
-from slipcar.planner.horizon_batch import Tails
-from slipcar.planner.horizon_setup import as_plan, handover_of, replanner, stakes_of
+from slipcar.planner.moments.gains import closed_loop_covariance, wrap
+from slipcar.planner.newton.traced import parameter_row
 from slipcar.planner.options import check_count, check_number
 from slipcar.planner.planning import plan
-from slipcar.planner.problem import Problem, model_of
+from slipcar.planner.problem.model import Problem, model_of
+from slipcar.planner.search.horizon_batch import Tails
+from slipcar.planner.search.horizon_setup import as_plan, handover_of, replanner, stakes_of
 
 Array = np.ndarray
 

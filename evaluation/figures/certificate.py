@@ -11,8 +11,8 @@ from matplotlib.ticker import MaxNLocator
 
 from slipcar.envs.car import CONTROL_NAMES, CONTROL_UNITS
 from slipcar.evaluation.figures.scene import GREY, INK, PALETTE, PAPER, new_figure, style
-from slipcar.planner.certificate import certify, model_for
-from slipcar.planner.maximum_principle import best_step, first_order, hamiltonian
+from slipcar.planner.extremal.certificate import certify, model_for
+from slipcar.planner.extremal.maximum_principle import best_step, first_order, hamiltonian
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

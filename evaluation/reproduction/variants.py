@@ -15,8 +15,8 @@ import numpy as np
 from slipcar.envs import cost
 from slipcar.envs.scenario import Scenario
 from slipcar.planner import Plan
-from slipcar.planner.convexify import linearize
-from slipcar.planner.problem import model_of
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import model_of
 
 Array = np.ndarray
 

@@ -10,7 +10,7 @@ import math
 
 import numba
 
-from slipcar.planner.expected.losses import DENSITY, EDGE, EDGE_DENSITY, EDGE_VALUE
+from slipcar.planner.moments.losses import DENSITY, EDGE, EDGE_DENSITY, EDGE_VALUE
 from slipcar.planner.newton.iterate_arrays import add_curvature
 
 _ROOT_HALF = math.sqrt(0.5)

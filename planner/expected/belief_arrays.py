@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from slipcar.planner.expected.arrays import row_loss, row_weight
-from slipcar.planner.expected.losses import FLOOR
+from slipcar.planner.moments.losses import FLOOR
 from slipcar.planner.newton.iterate_arrays import (
     congruence,
     covariance,

@@ -255,9 +255,7 @@ def _compiled(version: int) -> Any:
 
 def _sources() -> Any:
     here, there = Path(__file__), Path(newton.__file__)
-    own = [
-        here.with_name(f"{name}.py") for name in ("compiled", "arrays", "belief_arrays", "losses")
-    ]
+    own = [here.with_name(f"{name}.py") for name in ("compiled", "arrays", "belief_arrays")]
     return itertools.chain(own, (there.with_name(f"{name}.py") for name in newton.SOURCES))
 
 

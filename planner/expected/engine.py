@@ -7,8 +7,8 @@ from types import ModuleType
 import numpy as np
 
 from slipcar.planner.expected.guarded import Posed
-from slipcar.planner.method import driver
 from slipcar.planner.newton.functions import Functions
+from slipcar.planner.search.method import driver
 
 Array = np.ndarray
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.newton.functions import Functions, functions_of
-from slipcar.planner.problem import Model, model_of
-from slipcar.planner.recent import Recent
+from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.problem.recent import Recent
 
 Array = np.ndarray
 

@@ -18,14 +18,14 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.expected.belief import Belief, loss_at, propagate
 from slipcar.planner.expected.settings import TUNING, Tuning
-from slipcar.planner.expected.stakes import Stakes
-from slipcar.planner.feasibility import inconsistency
+from slipcar.planner.moments.belief import Belief, loss_at, propagate
+from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.lq import LqSolution, LqSolver, gramian_trace
 from slipcar.planner.newton.model import Iterate, Quadratic, evaluate, times
-from slipcar.planner.problem import Model
+from slipcar.planner.problem.feasibility import inconsistency
+from slipcar.planner.problem.model import Model
 from slipcar.planner.status import Status
 
 Array = np.ndarray

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.codegen.traced import Kernels
 from slipcar.planner.expected import compiled
 from slipcar.planner.expected.loop import Steered
 from slipcar.planner.expected.settings import TUNING, Tuning
-from slipcar.planner.expected.stakes import Stakes
+from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.caching import prepare
 from slipcar.planner.newton.compiled import CONVERGED, NOT_FINITE
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.run import STATUS
-from slipcar.planner.problem import Model
+from slipcar.planner.newton.traced import Kernels
+from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
 

@@ -1,6 +1,6 @@
 """The iteration of :mod:`.loop` compiled with numba, for one problem or many.
 
-It knows a problem by the addresses of its kernels (:mod:`slipcar.planner.codegen.traced`) and by
+It knows a problem by the addresses of its kernels (:mod:`slipcar.planner.newton.traced`) and by
 arrays; the same machine code serves every problem. The steps are those of `loop`, to rounding
 errors.
 

@@ -2,7 +2,7 @@
 
 Where a problem cannot be traced (its code branches on values, calls foreign libraries, ...) the
 same six are put together from the model's own functions, with Hessians by central differences
-of its Jacobians; see :mod:`slipcar.planner.codegen.traced` for what they return.
+of its Jacobians; see :mod:`slipcar.planner.newton.traced` for what they return.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.codegen.expression import TraceError
-from slipcar.planner.codegen.traced import Kernels, kind_of, parameter_row, trace
-from slipcar.planner.integrators import change, jacobian
-from slipcar.planner.problem import Model
-from slipcar.planner.recent import Recent
+from slipcar.planner.newton.traced import Kernels, kind_of, parameter_row, trace
+from slipcar.planner.problem.integrators import change, jacobian
+from slipcar.planner.problem.model import Model
+from slipcar.planner.problem.recent import Recent
+from slipcar.planner.trace.expression import TraceError
 
 Array = np.ndarray
 Rows = dict[str, Array]

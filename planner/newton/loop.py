@@ -36,8 +36,6 @@ import time
 
 import numpy as np
 
-from slipcar.planner.convexify import Linearization
-from slipcar.planner.feasibility import inconsistency, not_finite
 from slipcar.planner.history import Iteration
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.lq import LqSolution, LqSolver, gramian_trace
@@ -52,7 +50,9 @@ from slipcar.planner.newton.model import (
 from slipcar.planner.newton.settings import TUNING
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.problem import Model
+from slipcar.planner.problem.feasibility import inconsistency, not_finite
+from slipcar.planner.problem.linearization import Linearization
+from slipcar.planner.problem.model import Model
 from slipcar.planner.status import Status
 
 Array = np.ndarray

@@ -4,7 +4,7 @@
              + Σ_{k=1}^{K}   ½ d_kᵀQ_k d_k + q_kᵀd_k
     s.t.       d_{k+1} = A_k d_k + B_k e_k + f_k,   d_0 = 0,   G d_K + g = 0
 
-Solved as one banded system (:mod:`slipcar.planner.backends.kkt`), in which Q may be indefinite.
+Solved as one banded system (:mod:`slipcar.planner.lq.banded`), in which Q may be indefinite.
 Whether the problem is then convex in the controls, so that the solution is a minimum, is a question
 of inertia. The compiled iteration reads it off the pivots of its recursion (:mod:`.riccati`); here
 
@@ -20,7 +20,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from slipcar.planner.backends.kkt import BandedKkt
+from slipcar.planner.lq.banded import BandedKkt
 
 Array = np.ndarray
 

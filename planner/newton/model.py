@@ -9,12 +9,12 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner import moments
-from slipcar.planner.convexify import Linearization, nearest_semidefinite
+from slipcar.planner.moments import covariance as moments
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.lq import LqSolution, LqSolver
 from slipcar.planner.newton.settings import TUNING
-from slipcar.planner.problem import Model
+from slipcar.planner.problem.linearization import Linearization, nearest_semidefinite
+from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
 #: Steps to where the model is not finite are rejected: no warning is needed on the way.

@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.codegen.traced import Kernels
-from slipcar.planner.convexify import linearize
-from slipcar.planner.feasibility import not_finite
 from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.newton import compiled
 from slipcar.planner.newton.caching import prepare
 from slipcar.planner.newton.functions import Functions
 from slipcar.planner.newton.settings import TUNING
+from slipcar.planner.newton.traced import Kernels
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.problem import Model
+from slipcar.planner.problem.feasibility import not_finite
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import Model
 from slipcar.planner.status import Status
 
 Array = np.ndarray

@@ -1,4 +1,4 @@
-"""The LQ problem by generated code (:mod:`slipcar.planner.codegen.recursion`), or by loops."""
+"""The LQ problem by generated code (:mod:`slipcar.planner.newton.recursion`), or by loops."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from slipcar.evaluation.figures.certificate import plot_hamiltonian
 from slipcar.evaluation.figures.residuals import plot_residuals
 from slipcar.evaluation.residuals import Curve
 from slipcar.planner import plan
-from slipcar.planner.certificate import certify
+from slipcar.planner.extremal.certificate import certify
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import pytest
 from slipcar.envs import Scenario
 from slipcar.evaluation.residuals import first_shot, residual_curves, residuals_of
 from slipcar.planner import plan
-from slipcar.planner.certificate import certify
+from slipcar.planner.extremal.certificate import certify
 
 
 @pytest.fixture(scope="module")

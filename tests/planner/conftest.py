@@ -10,9 +10,9 @@ import pytest
 from slipcar.envs import Scenario
 from slipcar.planner import plan
 from slipcar.planner.expected import loop
-from slipcar.planner.expected.field import priced
 from slipcar.planner.expected.guarded import posed
-from slipcar.planner.expected.stakes import Stakes
+from slipcar.planner.moments.stakes import Stakes
+from slipcar.planner.search.field import priced
 
 
 @pytest.fixture(scope="session")

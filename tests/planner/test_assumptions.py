@@ -9,9 +9,9 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.checks import check_assumptions, check_derivatives
-from slipcar.planner.problem import model_of
-from slipcar.planner.recent import Recent, is_immutable
+from slipcar.planner.problem.checks import check_assumptions, check_derivatives
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.problem.recent import Recent, is_immutable
 
 
 class Cart:

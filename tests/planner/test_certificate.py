@@ -7,10 +7,9 @@ import pytest
 from scipy.optimize import minimize
 
 from slipcar.envs import Scenario
-from slipcar.planner import Plan, Status, moments, plan
-from slipcar.planner.certificate import certify, violations
-from slipcar.planner.convexify import linearize
-from slipcar.planner.maximum_principle import (
+from slipcar.planner import Plan, Status, plan
+from slipcar.planner.extremal.certificate import certify, violations
+from slipcar.planner.extremal.maximum_principle import (
     adjoint_of,
     best_step,
     first_order,
@@ -18,8 +17,10 @@ from slipcar.planner.maximum_principle import (
     held_variance_gradient,
     minimize_over_controls,
 )
-from slipcar.planner.problem import model_of
-from slipcar.planner.second_order import second_order
+from slipcar.planner.extremal.second_order import second_order
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import model_of
 
 
 class Cart:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from slipcar.planner.codegen.expression import (
+from slipcar.planner.trace.expression import (
     FUNCTIONS,
     Graph,
     TraceError,
@@ -17,10 +17,10 @@ from slipcar.planner.codegen.expression import (
     jacobian,
     reachable,
 )
-from slipcar.planner.codegen.vectorized import vectorize_kernel
+from slipcar.planner.trace.vectorized import vectorize_kernel
 
 try:
-    from slipcar.planner.codegen.llvm import compile_kernel
+    from slipcar.planner.trace.llvm import compile_kernel
 except ImportError:  # without llvmlite there is NumPy code alone
     COMPILERS = {"vectorized": vectorize_kernel}
 else:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.planner.codegen import traced as tracing
-from slipcar.planner.codegen.expression import TraceError
 from slipcar.planner.newton import functions as finding
+from slipcar.planner.newton import traced as tracing
 from slipcar.planner.newton.functions import functions_of
-from slipcar.planner.problem import model_of
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.trace.expression import TraceError
 
 NATIVE = [
     pytest.param(False, id="vectorized"),

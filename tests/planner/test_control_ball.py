@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import minimize
 
 from slipcar.envs import Scenario
-from slipcar.planner import Feedback, Status, backends, plan
-from slipcar.planner.backends.structured import StructuredSolver
-from slipcar.planner.control_set import project_controls
+from slipcar.planner import Feedback, Status, plan
+from slipcar.planner.convex import solvers as backends
+from slipcar.planner.convex.solvers.structured import StructuredSolver
+from slipcar.planner.problem.control_set import project_controls
 
 UNEVEN = np.linspace(0.0, 2.0, 25) ** 1.2
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.planner.convexify import convexify, linearize
-from slipcar.planner.problem import model_of
+from slipcar.planner.convex.convexify import convexify
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import model_of
 
 
 class Crane:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from slipcar.planner.derivatives import complex_step_jacobian
+from slipcar.planner.problem.derivatives import complex_step_jacobian
 
 
 def f(x):

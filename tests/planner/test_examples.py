@@ -14,8 +14,8 @@ from scipy.optimize import brentq
 from scipy.stats import rice
 
 from slipcar.planner import Feedback, Problem, Status, plan
-from slipcar.planner.codegen.traced import trace
-from slipcar.planner.problem import model_of
+from slipcar.planner.newton.traced import trace
+from slipcar.planner.problem.model import model_of
 
 FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(path.stem for path in FOLDER.glob("*.py"))

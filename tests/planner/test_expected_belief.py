@@ -1,7 +1,7 @@
 """Covariance, adjoint weights and gains against simulation, differences and Riccati's recursion.
 
 The system is a point mass whose noise grows with its speed, with rows that are affine in the state:
-then nothing is neglected, and every relation of :mod:`slipcar.planner.expected.belief` is exact.
+then nothing is neglected, and every relation of :mod:`slipcar.planner.moments.belief` is exact.
 """
 
 import dataclasses
@@ -10,11 +10,12 @@ import types
 import numpy as np
 import pytest
 
-from slipcar.planner.expected import belief, loop
+from slipcar.planner.expected import loop
 from slipcar.planner.expected.guarded import posed
-from slipcar.planner.expected.losses import deviations, loss
-from slipcar.planner.expected.stakes import Stakes
-from slipcar.planner.feedback import lqr_gains
+from slipcar.planner.moments import belief
+from slipcar.planner.moments.gains import lqr_gains
+from slipcar.planner.moments.losses import deviations, loss
+from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.model import evaluate
 
 N, M = 4, 2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slipcar.planner.expected.field import expected_cost, value
+from slipcar.planner.search.field import expected_cost, value
 
 
 def additive(mass, *, nodes=16):

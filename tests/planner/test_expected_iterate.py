@@ -11,9 +11,9 @@ import pytest
 
 from slipcar.planner import Status
 from slipcar.planner.expected import loop
-from slipcar.planner.expected.field import expected_cost, value
 from slipcar.planner.expected.guarded import posed
-from slipcar.planner.expected.losses import loss
+from slipcar.planner.moments.losses import loss
+from slipcar.planner.search.field import expected_cost, value
 
 # ------------------------------------------------------------------------------ tools
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from slipcar.planner.expected.losses import EDGE, deviations, loss
+from slipcar.planner.moments.losses import EDGE, deviations, loss
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs numba")
 

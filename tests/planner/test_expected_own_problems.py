@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slipcar.planner import Feedback, OpenLoop, Status, plan
-from slipcar.planner.feedback import lqr_gains
+from slipcar.planner.moments.gains import lqr_gains
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

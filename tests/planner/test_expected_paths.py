@@ -7,9 +7,9 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status
-from slipcar.planner.derivatives import complex_step_jacobian
 from slipcar.planner.expected import loop
 from slipcar.planner.expected.guarded import posed
+from slipcar.planner.problem.derivatives import complex_step_jacobian
 
 NUMBA = importlib.util.find_spec("numba") is not None
 needs_numba = pytest.mark.skipif(not NUMBA, reason="needs numba")

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from slipcar.planner import Feedback, OpenLoop, plan
-from slipcar.planner.feedback import lqr_gains, weight_matrix
+from slipcar.planner.moments.gains import lqr_gains, weight_matrix
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate
 from slipcar.planner import Feedback, OpenLoop, Plan, Status, plan
-from slipcar.planner.risk import wilson_interval
+from slipcar.planner.search.risk import wilson_interval
 
 FEW = 20_000
 

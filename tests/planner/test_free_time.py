@@ -8,7 +8,7 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.certificate import certify
+from slipcar.planner.extremal.certificate import certify
 
 DATA = json.loads(
     (Path(__file__).parents[1] / "data" / "free_time.json").read_text(encoding="utf-8")

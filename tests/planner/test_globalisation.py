@@ -5,12 +5,17 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status
-from slipcar.planner.acceleration import Acceleration
-from slipcar.planner.backends.structured import StructuredSolver
+from slipcar.planner.convex.acceleration import Acceleration
+from slipcar.planner.convex.scp import iterate
+from slipcar.planner.convex.solvers.structured import StructuredSolver
+from slipcar.planner.convex.trust_region import (
+    AdaptiveTrustRegion,
+    NoTrustRegion,
+    PaperTrustRegion,
+    Step,
+)
 from slipcar.planner.options import Options
-from slipcar.planner.problem import model_of
-from slipcar.planner.scp import iterate
-from slipcar.planner.trust_region import AdaptiveTrustRegion, NoTrustRegion, PaperTrustRegion, Step
+from slipcar.planner.problem.model import model_of
 
 
 def exact_subproblems(problem, *, trust=None, **changes):

@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.checks import _differences
-from slipcar.planner.convexify import linearize
-from slipcar.planner.integrators import INTEGRATORS, change, jacobian
-from slipcar.planner.problem import model_of
+from slipcar.planner.problem.checks import _differences
+from slipcar.planner.problem.integrators import INTEGRATORS, change, jacobian
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import model_of
 
 
 class Rocket:

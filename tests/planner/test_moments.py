@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slipcar.planner import moments, plan
-from slipcar.planner.convexify import linearize
-from slipcar.planner.problem import model_of
+from slipcar.planner import plan
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import model_of
 
 
 def random_system(seed, K=6, n=3, d=2):

@@ -13,8 +13,8 @@ from slipcar.evaluation import evaluate
 from slipcar.evaluation import statistics as evaluation_statistics
 from slipcar.evaluation.noise import block_noise
 from slipcar.planner import Feedback, OpenLoop, plan
-from slipcar.planner.monte_carlo import violations
-from slipcar.planner.risk import PricedRate, Risk, check_risk, wilson_interval
+from slipcar.planner.moments.monte_carlo import violations
+from slipcar.planner.search.risk import PricedRate, Risk, check_risk, wilson_interval
 
 EPISODES = 100_000
 

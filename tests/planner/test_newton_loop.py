@@ -9,12 +9,12 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.certificate import violations
+from slipcar.planner.extremal.certificate import violations
 from slipcar.planner.newton import functions as finding
 from slipcar.planner.newton import loop
 from slipcar.planner.newton.functions import functions_of
 from slipcar.planner.options import Options
-from slipcar.planner.problem import model_of
+from slipcar.planner.problem.model import model_of
 
 NUMBA = importlib.util.find_spec("numba") is not None
 needs_numba = pytest.mark.skipif(not NUMBA, reason="needs numba")

@@ -8,9 +8,8 @@ from hypothesis import assume, given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from slipcar.planner.codegen import recursion
-from slipcar.planner.codegen.expression import Graph
-from slipcar.planner.newton import lq
+from slipcar.planner.newton import lq, recursion
+from slipcar.planner.trace.expression import Graph
 
 riccati = pytest.importorskip("slipcar.planner.newton.riccati", reason="needs numba")
 sweep = pytest.importorskip("slipcar.planner.newton.sweep", reason="needs numba").sweep

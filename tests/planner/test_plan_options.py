@@ -12,7 +12,7 @@ import pytest
 
 from slipcar.envs import Scenario, car
 from slipcar.planner import Status, plan, plan_batch
-from slipcar.planner.recent import is_immutable
+from slipcar.planner.problem.recent import is_immutable
 
 GOAL = (2.2, 3.0, 0.0, 0.0, 0.0)
 ALONG = np.array([1.0, 0.0, 0.0, 0.0, 0.0])

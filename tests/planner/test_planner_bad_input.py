@@ -8,7 +8,7 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Problem, Status, plan
-from slipcar.planner.backends import make_solver
+from slipcar.planner.convex.solvers import make_solver
 
 
 class Cart:
@@ -227,7 +227,7 @@ def test_a_drift_that_is_not_finite_along_the_guess():
 @pytest.mark.parametrize("solver", ["osqp", "cvxpy"])
 def test_a_missing_solver_package_says_what_to_install(monkeypatch, solver):
     monkeypatch.setitem(sys.modules, solver, None)
-    monkeypatch.delitem(sys.modules, f"slipcar.planner.backends.{solver}", raising=False)
+    monkeypatch.delitem(sys.modules, f"slipcar.planner.convex.solvers.{solver}", raising=False)
     with pytest.raises(ImportError, match=rf'{solver}.*pip install "slipcar\[qp\]"'):
         plan(Cart(), solver=solver)
 

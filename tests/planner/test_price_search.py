@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from slipcar.planner.price_search import search_price
+from slipcar.planner.search.price_search import search_price
 
 # Measured on the paper's case with a prototype: price -> collision rate.
 OPEN_LOOP = (

@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import minimize
 
 from slipcar.planner import Plan, Status, plan
-from slipcar.planner.backends.structured import StructuredSolver
-from slipcar.planner.convexify import linearize, nearest_semidefinite
-from slipcar.planner.derivatives import gradient_and_hessian
-from slipcar.planner.problem import model_of
+from slipcar.planner.convex.solvers.structured import StructuredSolver
+from slipcar.planner.problem.derivatives import gradient_and_hessian
+from slipcar.planner.problem.linearization import linearize, nearest_semidefinite
+from slipcar.planner.problem.model import model_of
 
 UNEVEN = np.linspace(0.0, 2.0, 21) ** 1.2
 

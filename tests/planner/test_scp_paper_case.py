@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from slipcar.planner import Iteration, Status, moments, plan
-from slipcar.planner.convexify import linearize
-from slipcar.planner.problem import model_of
+from slipcar.planner import Iteration, Status, plan
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import model_of
 
 
 def test_default_stop_meets_the_published_effort(paper, rollout):

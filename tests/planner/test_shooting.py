@@ -5,17 +5,17 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.certificate import certify, model_for
-from slipcar.planner.maximum_principle import first_order
-from slipcar.planner.problem import model_of
-from slipcar.planner.second_order import second_order
-from slipcar.planner.shooting import (
+from slipcar.planner.extremal.certificate import certify, model_for
+from slipcar.planner.extremal.maximum_principle import first_order
+from slipcar.planner.extremal.second_order import second_order
+from slipcar.planner.extremal.shooting import (
     START_WITHIN,
     improved,
     retry_within,
     shoot,
     shoot_from,
 )
+from slipcar.planner.problem.model import model_of
 
 
 class Pendulum:

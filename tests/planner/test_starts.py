@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario, routes
-from slipcar.planner import Status, plan, starts
-from slipcar.planner.problem import model_of
+from slipcar.planner import Status, plan
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.search import starts
 
 WALL = Scenario(
     start=np.zeros(5),

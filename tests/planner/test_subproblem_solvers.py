@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.planner import Status, backends, plan
-from slipcar.planner.backends.structured import StructuredSolver
+from slipcar.planner import Status, plan
+from slipcar.planner.convex import solvers as backends
+from slipcar.planner.convex.solvers.structured import StructuredSolver
 
 PAPER = Scenario.named("paper")
 START_AT_REST = np.linspace(0.0, 1.0, 41)[:, None] * (PAPER.goal - PAPER.start)  # θ = v = 0

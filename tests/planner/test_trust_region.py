@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.planner import Status, plan, trust_region
-from slipcar.planner.trust_region import (
+from slipcar.planner import Status, plan
+from slipcar.planner.convex import trust_region
+from slipcar.planner.convex.trust_region import (
     AdaptiveTrustRegion,
     NoTrustRegion,
     PaperTrustRegion,

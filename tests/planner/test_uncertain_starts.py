@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import binom, norm
 
 from slipcar.planner import Plan, RecedingHorizon, Status, plan, plan_batch
-from slipcar.planner.certificate import certify
-from slipcar.planner.feedback import lqr_gains
-from slipcar.planner.monte_carlo import violations
+from slipcar.planner.extremal.certificate import certify
+from slipcar.planner.moments.gains import lqr_gains
+from slipcar.planner.moments.monte_carlo import violations
 
 #: Position and speed, correlated.
 SPREAD = np.array([[0.04, 0.012], [0.012, 0.09]])

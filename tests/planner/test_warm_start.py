@@ -7,8 +7,8 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.problem import model_of
-from slipcar.planner.warm_start import given_guess
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.search.warm_start import given_guess
 
 
 class Hanging:

@@ -1,0 +1,301 @@
+"""What a plan proves: its multipliers and the residuals of the maximum principle (SPEC §3.7).
+
+The iteration promises (Theorems 3.3 and 3.4) that what it accumulates at satisfies the maximum
+principle of the *non-linear* problem, if p⁰_k ≠ 0 all along. Both are checked here afterwards,
+from the plan and the problem alone: the adjoint equation is run backwards from 𝔭 (see
+:mod:`.maximum_principle`), and every condition's residual is measured, in the problem's units and
+relative to its natural scale. Zero residuals make the plan an extremal, a candidate for a local
+optimum: the maximum principle is necessary, not sufficient.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slipcar.planner.extremal.maximum_principle import (
+    FirstOrder,
+    Scales,
+    adjoint_of,
+    best_step,
+    first_order,
+    scales,
+    time_slope,
+)
+from slipcar.planner.multipliers import Multipliers
+from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.status import Status
+
+if TYPE_CHECKING:
+    from slipcar.planner.plan import Plan
+
+Array = np.ndarray
+
+#: Multipliers are normalised to length one; a |p⁰| below this is as good as none. (Early iterates
+#: of hard worlds are far from anything feasible, and have multipliers of 10⁸ for a cost of one.)
+_VANISHING = 1e-14
+#: A sub-problem that lacks more than this of its terminal condition, per unit of the state, was
+#: solved with that condition relaxed: its multiplier is the limit ρ, and normal by construction.
+_RELAXED = 1e-6
+#: Feasibility is asked for more strictly than optimality, as the iteration does.
+_FEASIBLE, _FEASIBILITY = ("dynamics", "terminal condition", "u in U"), 1e-4
+_quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+
+@dataclasses.dataclass(frozen=True)
+class Violations:
+    """How far a trajectory with multiplier 𝔭 is from the maximum principle, in its own units.
+
+    Attributes:
+        dynamics: largest |F_k(x_k, u_k) − x_{k+1}|.
+        terminal: largest |g(x_K)| beyond its tolerance.
+        control: largest |argmax_U H_k − u_k|, p from the adjoint recursion.
+        hamiltonian: largest max_U H_k − H_k(u_k) ≥ 0.
+        bounds: largest distance of a u_k from U.
+        adjoint: λ_1..λ_K = −p_1..−p_K by the recursion, (K, n).
+        scales: what counts as one.
+    """
+
+    dynamics: float
+    terminal: float
+    control: float
+    hamiltonian: float
+    bounds: float
+    adjoint: Array
+    scales: Scales
+
+    @property
+    def relative(self) -> dict[str, float]:
+        """Residuals by name, divided by their scales."""
+        return {
+            "dynamics": self.dynamics / self.scales.state,
+            "terminal condition": self.terminal / self.scales.state,
+            "u = argmax H": self.control / self.scales.control,
+            "u in U": self.bounds / self.scales.control,
+        }
+
+    @property
+    def largest(self) -> float:
+        """The largest of them."""
+        values = np.array(list(self.relative.values()))
+        return float(values.max()) if np.isfinite(values).all() else np.inf
+
+
+@_quiet
+def violations(
+    model: Model,
+    x: Array,
+    u: Array,
+    terminal: Array,
+    *,
+    variance_weight: float,
+    terminal_tolerance: float = 0.0,
+) -> Violations:
+    """Measure any trajectory: an iterate of SCP, a point of the shooting method, a plan.
+
+    Args:
+        model: the problem.
+        x: states, (N, n).
+        u: controls, (K, m).
+        terminal: ν = −𝔭 of the sub-problem, (q,).
+        variance_weight: w ≥ 0.
+        terminal_tolerance: half-width of the terminal box.
+    """
+    at = first_order(model, x, u, variance_weight)
+    return _violations(model, at, terminal, terminal_tolerance)
+
+
+def _violations(model: Model, at: FirstOrder, terminal: Array, tolerance: float) -> Violations:
+    u, g = at.lin.u, at.lin.g
+    adjoint = adjoint_of(at, terminal)
+    e, gain = best_step(model, at, adjoint)
+    return Violations(
+        dynamics=_largest(at.lin.defect),
+        terminal=_largest(np.maximum(np.abs(g) - tolerance, 0.0)),
+        control=_largest(e),
+        hamiltonian=max(0.0, float(np.max(gain))),
+        bounds=_largest(model.admissible(u) - u),
+        adjoint=adjoint,
+        scales=scales(model, at, adjoint),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Certificate:
+    """The maximum principle, checked; `print(certificate)` says what came out.
+
+    Attributes:
+        status: of the plan.
+        multipliers: (𝔭, p⁰, p¹) and p(t) of the plan, normalised to ‖(𝔭, p⁰, p¹)‖ = 1.
+        terminal_history: 𝔭_k of every sub-problem, normalised, (iterations, q).
+        cost_history: p⁰_k, (iterations,).
+        trust_region_history: p¹_k, (iterations,).
+        relaxed: sub-problems whose terminal condition had to be relaxed, (iterations,) bool.
+        violations: residuals of the non-linear problem.
+        adjoint: p at every node by the adjoint recursion, p⁰ = −1, (N, n).
+        adjoint_difference: largest difference from the sub-problem's own adjoint.
+        transversality: max_U H at the end, which vanishes when the final time is free; None when
+            it is fixed.
+        cost_rate: mean cost per time, the scale of `transversality`.
+        tolerance: largest relative residual of an extremal; of dynamics, terminal condition and
+            bounds at most 1e-4.
+    """
+
+    status: Status
+    multipliers: Multipliers
+    terminal_history: Array
+    cost_history: Array
+    trust_region_history: Array
+    relaxed: Array
+    violations: Violations
+    adjoint: Array
+    adjoint_difference: float
+    transversality: float | None
+    cost_rate: float
+    tolerance: float
+
+    @property
+    def smallest_cost_multiplier(self) -> float:
+        """min_k |p⁰_k|."""
+        return float(np.min(np.abs(self.cost_history), initial=abs(self.multipliers.cost)))
+
+    @property
+    def normal(self) -> bool:
+        """Whether p⁰_k ≠ 0 at every iteration (the hypothesis of Theorem 3.4)."""
+        return self.smallest_cost_multiplier > _VANISHING
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """Every residual relative to its scale."""
+        found = self.violations.relative
+        found["adjoint equation"] = self.adjoint_difference / self.violations.scales.adjoint
+        if self.transversality is not None:
+            found["transversality"] = abs(self.transversality) / self.cost_rate
+        return found
+
+    @property
+    def residual(self) -> float:
+        """The largest relative residual; inf if one is not finite."""
+        values = np.array(list(self.residuals.values()))
+        return float(values.max()) if np.isfinite(values).all() else np.inf
+
+    @property
+    def extremal(self) -> bool:
+        """Whether the plan is an extremal to the tolerance, whatever its status says."""
+        return self.normal and not self._failed()
+
+    def _failed(self) -> list[str]:
+        """Conditions that do not hold, the worst first."""
+        excess = {}
+        for name, value in self.residuals.items():
+            limit = min(self.tolerance, _FEASIBILITY) if name in _FEASIBLE else self.tolerance
+            if not value <= limit:
+                excess[name] = np.nan_to_num(value / limit, nan=np.inf)
+        return sorted(excess, key=lambda name: -excess[name])
+
+    def __str__(self) -> str:
+        v = self.violations
+        if self.extremal:
+            verdict = f"EXTREMAL to {self.residual:.1e}: the maximum principle holds"
+        elif not self.normal:
+            verdict = "NO extremal shown: the cost's multiplier p⁰ vanishes (abnormal)"
+        else:
+            worst = self._failed()[0]
+            verdict = f"NO extremal: {worst} violated by {self.residuals[worst]:.1e} of its scale"
+        relaxed = int(self.relaxed.sum())
+        advice = (
+            " (CONVERGED: ask for a smaller tolerance)" if self.status.ok else f" ({self.status})"
+        )
+        lines = [
+            verdict + (f" ({self.status})" if self.extremal else advice),
+            f"  normal      min |p⁰_k| = {self.smallest_cost_multiplier:.3g} over "
+            f"{len(self.cost_history)} iterations"
+            + (f", {relaxed} with a relaxed terminal condition" if relaxed else ""),
+            f"  dynamics    mean misses its own step by {v.dynamics:.1e}",
+            f"  terminal    |g(x(T))| = {v.terminal:.1e} beyond its tolerance",
+            f"  adjoint     p from 𝔭 and p of the sub-problem differ by "
+            f"{self.adjoint_difference:.1e} of {v.scales.adjoint:.2g}",
+            f"  maximality  u misses argmax H by {v.control:.1e} of {v.scales.control:.2g}; "
+            f"H by {v.hamiltonian:.1e}; U by {v.bounds:.1e}",
+        ]
+        if self.transversality is not None:
+            lines.append(f"  final time  max H = {self.transversality:.1e} at the end")
+        return "\n".join(lines)
+
+
+@_quiet
+def certify(
+    plan: Plan, *, tolerance: float = 1e-2, time_weight: float | None = None
+) -> Certificate:
+    """Check a plan against the maximum principle; never raises for how the plan ended.
+
+    Args:
+        plan: any plan that knows its problem.
+        tolerance: largest relative residual of an extremal (of feasibility at most 1e-4). Of
+            100 random worlds 99 meet the default with `plan`'s own default stopping rule, and all
+            with its `tolerance=1e-6`.
+        time_weight: cost of a unit of final time when the final time was free: its
+            transversality condition is checked too. None when it was fixed.
+
+    Raises:
+        ValueError: if the plan does not know its problem, or the tolerance is not > 0.
+    """
+    if not (np.isfinite(tolerance) and tolerance > 0.0):
+        raise ValueError(f"tolerance must be finite and > 0, not {tolerance!r}")
+    model = model_for(plan)
+    weight = plan.options["variance_weight"]
+    at = first_order(model, plan.mean, plan.controls, weight)
+    own = plan.multipliers
+    found = _violations(model, at, -own.terminal, plan.options["terminal_tolerance"])
+    adjoint = -np.vstack([at.lin.A[0].T @ found.adjoint[0], found.adjoint])
+    history = [
+        Multipliers(-h.terminal_multiplier, -1.0, -h.trust_multiplier, own.adjoint).normalized()
+        for h in plan.history
+    ]
+    slope = None
+    if time_weight is not None:
+        slope = time_slope(model, at, found.adjoint, weight) + time_weight
+    return Certificate(
+        status=plan.status,
+        multipliers=own.normalized(),
+        terminal_history=np.reshape(
+            [h.terminal for h in history], (len(history), len(own.terminal))
+        ),
+        cost_history=np.array([h.cost for h in history]),
+        trust_region_history=np.array([h.trust_region for h in history]),
+        relaxed=np.array(
+            [h.virtual_control > _RELAXED * found.scales.state for h in plan.history], dtype=bool
+        ),
+        violations=found,
+        adjoint=adjoint,
+        adjoint_difference=_largest(adjoint[1:] - own.adjoint[1:]),
+        transversality=None if slope is None else -slope,
+        cost_rate=max(
+            (at.lin.effort + at.lin.penalty) / (model.times[-1] - model.times[0]),
+            abs(time_weight or 0.0),
+            1e-300,
+        ),
+        tolerance=float(tolerance),
+    )
+
+
+def model_for(plan: Plan) -> Model:
+    """The completed problem of a plan, with the integrator it was made with.
+
+    Raises:
+        ValueError: if the plan does not know its problem.
+    """
+    if plan.problem is None:
+        raise ValueError(
+            "this plan does not know its problem (it was loaded from a file that could not keep "
+            "it), and this needs its dynamics: plan.replace(problem=...) first"
+        )
+    model = model_of(plan.problem)
+    integrator = plan.options.get("integrator", model.integrator)
+    return dataclasses.replace(model, integrator=integrator)
+
+
+def _largest(values: Array) -> float:
+    return float(np.max(np.abs(values), initial=0.0))

@@ -1,0 +1,167 @@
+"""The conditions of an extremal as equations F(x, u, λ, ν) = 0, and Newton's step on them.
+
+    x_k + dt b(x_k, u_k) − x_{k+1} = 0        ∇ℓ_k + A_kᵀ λ_{k+1} − λ_k = 0
+    u_k − Π_U(u_k − D⁻¹ ∂L/∂u_k) = 0          g − Π_box(g + ν/s) = 0
+
+with L the Lagrangian and Π the projections onto the admissible controls and the terminal box: a
+multiplier of the right sign wherever one of them is on its boundary, and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from slipcar.planner.extremal.coupling import coupled_step
+from slipcar.planner.extremal.maximum_principle import FirstOrder, Scales, first_order
+from slipcar.planner.extremal.newton_step import NewtonSystem, Pieces, Step
+from slipcar.planner.extremal.second_order import SecondOrder, second_order
+from slipcar.planner.problem.control_set import project_controls
+from slipcar.planner.problem.model import Model
+
+Array = np.ndarray
+
+#: Active sets tried for one Newton step.
+_PIECE_SOLVES = 8
+#: How Λ moves with a step is solved for to this part of the residual's square.
+_COUPLING_PART = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A primal-dual point with its residuals.
+
+    Attributes:
+        first: first derivatives there.
+        adjoint: λ_1..λ_K, (K, n).
+        terminal: ν, (q,).
+        slope: gradient of the Lagrangian with respect to u, (K, m).
+        norm: 2-norm of all residuals, each relative to its scale.
+        largest: largest of them.
+    """
+
+    first: FirstOrder
+    adjoint: Array
+    terminal: Array
+    slope: Array
+    norm: float
+    largest: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """The equations to be solved.
+
+    Attributes:
+        model: the problem.
+        variance_weight: w ≥ 0.
+        tolerance: half-width of the terminal box.
+        scales: what counts as one.
+    """
+
+    model: Model
+    variance_weight: float
+    tolerance: float
+    scales: Scales
+
+    def at(self, x: Array, u: Array, adjoint: Array, terminal: Array) -> Point:
+        """Residuals at a point."""
+        model, scales = self.model, self.scales
+        first = first_order(model, x, u, self.variance_weight)
+        lin = first.lin
+        rest = first.state_gradient - adjoint
+        rest[:-1] += np.matmul(adjoint[1:, None], lin.A[1:])[:, 0]
+        rest[-1] += terminal @ lin.G
+        slope = first.slope(adjoint)
+        wanted = self._wanted(first.sub.R, u, slope)
+        control = u - project_controls(wanted, model.lower, model.upper, model.radius)
+        end = lin.g - np.clip(self._pressed(lin.g, terminal), -self.tolerance, self.tolerance)
+        parts = np.concatenate(
+            [
+                lin.defect.ravel() / scales.state,
+                end / scales.state,
+                rest.ravel() / scales.adjoint,
+                control.ravel() / scales.control,
+            ]
+        )
+        norm = float(np.linalg.norm(parts))
+        largest = float(np.max(np.abs(parts))) if np.isfinite(norm) else np.inf
+        return Point(first, adjoint, terminal, slope, norm, largest)
+
+    def _wanted(self, R: Array, u: Array, slope: Array) -> Array:
+        """Where −D⁻¹ slope leads from u; its projection onto U is u at an extremal, (K, m)."""
+        diagonal = np.einsum("kii->ki", R)
+        if np.isfinite(self.model.radius):  # a projection onto a ball needs one scale per node
+            diagonal = diagonal.max(axis=1, keepdims=True)
+        return u - slope / diagonal
+
+    def _pressed(self, g: Array, terminal: Array) -> Array:
+        """Where ν/s leads from g; its projection onto the terminal box is g at one, (q,)."""
+        return g + terminal * (self.scales.state / self.scales.adjoint)
+
+    def moved(self, here: Point, step: Step, length: float) -> Point:
+        """The point a part of the step away."""
+        lin = here.first.lin
+        x = lin.x.copy()
+        x[1:] += length * step.d
+        return self.at(
+            x,
+            lin.u + length * step.e,
+            here.adjoint + length * step.adjoint,
+            here.terminal + length * step.terminal,
+        )
+
+    def newton(self, here: Point) -> Step | None:
+        """The Newton step; None if its matrix is singular."""
+        first = here.first
+        second = second_order(self.model, first, here.adjoint, here.terminal, self.variance_weight)
+        pieces = self._pieces(here, second, None)
+        settled: tuple[NewtonSystem, Step] | None = None
+        for _ in range(_PIECE_SOLVES):
+            system = NewtonSystem(
+                first, second, here.adjoint, here.terminal, pieces, self.tolerance
+            )
+            step = system.solve() if system.regular else None
+            if step is None or not step.finite:
+                break  # with so many controls held, the end is out of reach
+            settled = system, step
+            found = self._pieces(here, second, step)
+            if found.same(pieces):
+                break
+            pieces = found
+        if settled is None:
+            return None
+        system, step = settled
+        if first.weights is not None:
+            # As exact as the residual is small: quadratic convergence, and no more work.
+            small = min(here.largest, 1.0)
+            enough = _COUPLING_PART * small * small * self.scales.adjoint
+            weight = self.variance_weight
+            step = coupled_step(self.model, first, second, system, step, weight, enough)
+        return step if step.finite else None
+
+    def _pieces(self, here: Point, second: SecondOrder, step: Step | None) -> Pieces:
+        """The pieces at a point, or those a step leads to by the linearised conditions."""
+        model, sub = self.model, here.first.sub
+        c, g, u, slope, terminal = sub.b, sub.g, here.first.lin.u, here.slope, here.terminal
+        if step is not None:
+            c = c + np.matmul(sub.a, step.d[..., None])[..., 0]
+            g, u, terminal = g + sub.G @ step.d[-1], u + step.e, terminal + step.terminal
+            slope = slope + np.matmul(step.adjoint[:, None], sub.B)[:, 0]
+            slope += np.matmul(second.uu, step.e[..., None])[..., 0]
+            slope[1:] += np.matmul(second.ux[1:], step.d[:-1, :, None])[..., 0]
+        wanted = self._wanted(sub.R, u, slope)
+        ball = np.zeros(len(u), dtype=bool)
+        if np.isfinite(model.radius):
+            inside = np.clip(wanted, model.lower, model.upper)
+            ball = np.linalg.norm(inside, axis=1) > model.radius
+        pressed = self._pressed(g, terminal)
+        side = np.where(np.abs(pressed) > self.tolerance, np.sign(pressed), 0.0)
+        return Pieces(
+            hinge=c > 0.0,
+            lower=wanted < model.lower,
+            upper=wanted > model.upper,
+            ball=ball,
+            terminal=side if self.tolerance > 0.0 else np.ones(len(sub.g)),
+        )

@@ -1,0 +1,276 @@
+"""The discrete maximum principle: what makes a trajectory an extremal (paper §2.2, SPEC §3.7).
+
+With ℓ_k the costs charged at node k (hinges, state costs, the variance penalty through σ(x_k)),
+F_k(x, u) the step from node k to k + 1 and p⁰ = −1, a trajectory x_0..x_K, u_0..u_{K−1} is an
+extremal with multiplier 𝔭 if
+
+    x_{k+1} = F_k(x_k, u_k),   g(x_K) = 0                                     dynamics, terminal
+    p_k = (∂F_k/∂x)ᵀ p_{k+1} + p⁰ ∇ℓ_k,   p_K = (∂g/∂x)ᵀ 𝔭 + p⁰ ∇ℓ_K         adjoint equation
+    u_k = argmax_{v ∈ U} H_k(v),   H_k(v) = p_{k+1}ᵀ b(t_k, x_k, v) + p⁰ vᵀRv   maximality
+
+Which variance is meant: w ∫ tr Σ dt = w Σ dt tr(Λ_{k+1} σ_k σ_kᵀ), and the adjoint equation
+holds Λ (so ∂A/∂x is not differentiated), as every sub-problem does. This is the maximum principle
+that accumulation points of the iteration satisfy; :func:`held_variance_gradient` gives the term
+that is left out.
+
+All gradients are those of a sub-problem at zero deviation: costs are defined in one place.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from slipcar.planner.convex.convexify import Subproblem, convexify
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.problem.linearization import Linearization, linearize
+from slipcar.planner.problem.model import Model
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstOrder:
+    """First derivatives along a trajectory.
+
+    Attributes:
+        lin: the model and its Jacobians there.
+        weights: Λ_1..Λ_K of the variance penalty, (K, n, n), or None for w = 0.
+        sub: the sub-problem there, without a trust region: its gradients are those of the costs.
+    """
+
+    lin: Linearization
+    weights: Array | None
+    sub: Subproblem
+
+    @property
+    def push(self) -> Array:
+        """Slope of the hinges' φ, h max(0, c), (K, p)."""
+        return self.sub.h * np.maximum(self.sub.b, 0.0)
+
+    @property
+    def state_gradient(self) -> Array:
+        """∇ℓ at nodes 1..K, (K, n)."""
+        return self.sub.q + np.matmul(self.push[:, None], self.sub.a)[:, 0]
+
+    def slope(self, adjoint: Array) -> Array:
+        """Gradient of cost and dynamics with respect to u, B_kᵀ λ_{k+1} + ∇(dt uᵀRu), (K, m).
+
+        Args:
+            adjoint: λ_1..λ_K = −p_1..−p_K, (K, n).
+        """
+        return self.sub.r + np.matmul(adjoint[:, None], self.sub.B)[:, 0]
+
+
+def first_order(
+    model: Model, x: Array, u: Array, variance_weight: float, weights: Array | None = None
+) -> FirstOrder:
+    """Linearise along x (N, n), u (K, m).
+
+    Args:
+        model: the problem.
+        x: states.
+        u: controls.
+        variance_weight: w ≥ 0.
+        weights: Λ to hold; by default that of this trajectory.
+    """
+    lin = linearize(model, x, u)
+    variance = None
+    if variance_weight > 0.0:
+        d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], x[:-1]))
+        if weights is None:
+            weights = moments.adjoint_weights(lin.A, model.dt)
+        variance = moments.variance_penalty(variance_weight, lin.sigma, d_sigma, weights, model.dt)
+    sub = convexify(
+        model,
+        lin,
+        variance=variance,
+        composite=True,
+        trust_multiplier=0.0,
+        trust_weight=None,
+        rho=1.0,
+    )
+    return FirstOrder(lin, weights, sub)
+
+
+def adjoint_of(at: FirstOrder, terminal: Array) -> Array:
+    """λ_1..λ_K by the adjoint recursion from ν = −𝔭 (q,): (K, n), gradients of the cost to go."""
+    A = at.lin.A
+    adjoint = at.state_gradient
+    adjoint[-1] += at.lin.G.T @ terminal
+    for k in range(len(A) - 1, 0, -1):
+        adjoint[k - 1] += A[k].T.dot(adjoint[k])
+    return adjoint
+
+
+def best_step(model: Model, at: FirstOrder, adjoint: Array) -> tuple[Array, Array]:
+    """From u to argmax_U H, and what that gains in H: (K, m) and (K,).
+
+    H is quadratic in u for dynamics affine in it; otherwise this is its quadratic model at u,
+    whose argmax is u itself exactly when u is stationary for H.
+
+    Args:
+        model: the problem.
+        at: first derivatives at the trajectory.
+        adjoint: λ_1..λ_K, (K, n).
+    """
+    slope = at.slope(adjoint)
+    e = minimize_over_controls(model, at.sub.R, slope, at.lin.u)
+    bent = np.matmul(at.sub.R, e[..., None])[..., 0]
+    return e, -np.einsum("ki,ki->k", e, slope + 0.5 * bent) / model.dt
+
+
+def minimize_over_controls(model: Model, R: Array, r: Array, u: Array) -> Array:
+    """The e of least ½ eᵀRe + rᵀe over u + e ∈ U, for every row: (K, m).
+
+    The multiplier κ ≥ 0 of the ball adds ½ κ ‖u + e‖², whose norm falls as κ grows: bisection.
+
+    Args:
+        model: whose `lower`, `upper` and `radius` are U.
+        R: (K, m, m), positive definite.
+        r: (K, m).
+        u: (K, m).
+    """
+    lower, upper = model.lower - u, model.upper - u
+    e = _minimize_over_box(R, r, lower, upper)
+    if not np.isfinite(model.radius):
+        return e
+    out = np.linalg.norm(u + e, axis=1) > model.radius
+    if not out.any():
+        return e
+    R, r, u, lower, upper = R[out], r[out], u[out], lower[out], upper[out]
+    eye = np.eye(u.shape[1])
+
+    def held(kappa: Array) -> Array:
+        return _minimize_over_box(
+            R + kappa[:, None, None] * eye, r + kappa[:, None] * u, lower, upper
+        )
+
+    # Where the box alone would go, ‖R e + r‖ pulls: a few times that keeps anything inside.
+    low, high = np.zeros(len(u)), np.einsum("kii->k", R)
+    for _ in range(200):
+        long = np.linalg.norm(u + held(high), axis=1) > model.radius
+        if not long.any():
+            break
+        high = np.where(long, 4.0 * high, high)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        long = np.linalg.norm(u + held(middle), axis=1) > model.radius
+        low, high = np.where(long, middle, low), np.where(long, high, middle)
+    e[out] = held(high)
+    return e
+
+
+def _minimize_over_box(R: Array, r: Array, lower: Array, upper: Array) -> Array:
+    """The same over lower ≤ e ≤ upper: coordinate by coordinate; a diagonal R takes one pass."""
+    diagonal = np.einsum("kii->ki", R)
+    coupled = bool((R - diagonal[..., None] * np.eye(R.shape[1])).any())
+    e = np.clip(-r / diagonal, lower, upper)
+    for _ in range(1000 if coupled else 0):
+        before = e.copy()
+        for i in range(e.shape[1]):
+            slope = np.einsum("kj,kj->k", R[:, i], e) + r[:, i]
+            e[:, i] = np.clip(e[:, i] - slope / diagonal[:, i], lower[:, i], upper[:, i])
+        if np.max(np.abs(e - before)) <= 1e-15 * (1.0 + np.max(np.abs(e))):
+            break
+    return e
+
+
+@dataclasses.dataclass(frozen=True)
+class Scales:
+    """What counts as one in each residual, in the problem's own units.
+
+    Attributes:
+        state: 1 + max |x|, for defects and the terminal residual.
+        control: max |u|; at least what moves the state by 1e-3 of its scale over the horizon.
+        adjoint: max |λ|; at least what such a control would answer to.
+        hamiltonian: ‖R‖ times the control's scale squared.
+    """
+
+    state: float
+    control: float
+    adjoint: float
+    hamiltonian: float
+
+
+def scales(model: Model, at: FirstOrder, adjoint: Array) -> Scales:
+    """Natural scales at a trajectory and its adjoint λ (K, n)."""
+    state = 1.0 + float(np.max(np.abs(at.lin.x)))
+    reach = np.abs(at.lin.B)
+    control = 1e-3 * state / max(float(np.max(reach.sum(axis=0))), 1e-300)
+    answer = float(np.max(np.abs(at.sub.R))) * control / max(float(reach.max()), 1e-300)
+    control = max(float(np.max(np.abs(at.lin.u))), control)
+    return Scales(
+        state=state,
+        control=control,
+        adjoint=max(float(np.max(np.abs(adjoint))), answer),
+        hamiltonian=float(np.max(np.abs(model.R))) * control * control,
+    )
+
+
+def hamiltonian(model: Model, t: Array, x: Array, p: Array, u: Array) -> Array:
+    """H up to what does not depend on u: pᵀb(t, x, u) − uᵀRu, batched over leading axes.
+
+    Args:
+        model: the problem.
+        t: times, (...,).
+        x: states, (..., n).
+        p: adjoints at the end of the interval, p⁰ = −1, (..., n).
+        u: controls, (..., m).
+    """
+    many = np.broadcast_shapes(np.shape(t), x.shape[:-1], u.shape[:-1])
+    t, u = np.broadcast_to(t, many), np.broadcast_to(u, (*many, u.shape[-1]))
+    b = model.drift(t, np.broadcast_to(x, (*many, x.shape[-1])), u)
+    return np.einsum("...i,...i->...", p, b) - np.einsum("...i,ij,...j->...", u, model.R, u)
+
+
+def time_slope(model: Model, at: FirstOrder, adjoint: Array, variance_weight: float) -> float:
+    """∂/∂T of the Lagrangian, −max_U H(T) of the paper's transversality condition (Theorem 5.1).
+
+    The time grid is stretched about its beginning, x, u and λ being held: by the envelope theorem
+    this is how the optimal cost changes with the horizon. (A and Λ of the variance follow the
+    grid: only their change with x is left out, as everywhere.)
+
+    Args:
+        model: the problem.
+        at: first derivatives at the trajectory.
+        adjoint: λ_1..λ_K, (K, n).
+        variance_weight: w ≥ 0.
+    """
+    begin, horizon = model.times[0], model.times[-1] - model.times[0]
+    step = 1e-5
+
+    def lagrangian(stretch: float) -> float:
+        stretched = dataclasses.replace(
+            model, times=begin + stretch * (model.times - begin), dt=stretch * model.dt
+        )
+        lin = linearize(stretched, at.lin.x, at.lin.u)
+        value = lin.effort + lin.penalty + lin.running + float(np.vdot(adjoint, lin.defect))
+        if variance_weight > 0.0:
+            S = moments.covariance_of(stretched, lin)
+            value += variance_weight * moments.trace_integral(S, stretched.dt)
+        return value
+
+    return (lagrangian(1.0 + step) - lagrangian(1.0 - step)) / (2.0 * step * horizon)
+
+
+def held_variance_gradient(at: FirstOrder, A_x: Array, S: Array, variance_weight: float) -> Array:
+    """What the adjoint equation leaves out by holding Λ: the gradient of w ∫ tr Σ through A.
+
+        ∂/∂A_k of w Σ dt tr Σ_k  =  2 w Λ_{k+1} A_k Σ_k
+
+    Args:
+        at: first derivatives, with Λ.
+        A_x: ∂A_k/∂x_k, (K, n, n, n), of :mod:`.second_order`.
+        S: Σ at every node, (N, n, n).
+        variance_weight: w ≥ 0.
+
+    Returns:
+        At nodes 1..K (zero at the last, which drives nothing), (K, n).
+    """
+    found = np.zeros_like(at.lin.defect)
+    if at.weights is not None:
+        force = 2.0 * variance_weight * at.weights @ at.lin.A @ S[:-1]
+        found[:-1] = np.einsum("kab,kabi->ki", force, A_x)[1:]
+    return found

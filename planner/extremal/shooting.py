@@ -1,0 +1,253 @@
+"""Shooting: Newton's method on the maximum principle, started by an SCP iterate (paper §3.3).
+
+Late iterates of SCP carry multipliers close to those of the extremal they converge to (Theorem
+3.4). From there the two-point boundary value problem of :mod:`.maximum_principle` is solved by
+Newton's method: quadratic, where SCP is linear.
+
+All states and adjoints are unknowns (multiple shooting), and each step is a banded solve
+(:mod:`.newton_step`). Condensed to the n unknowns 𝔭 of single shooting it would cost the same;
+but single shooting integrates the canonical equations, hinges and all, from end to end before
+it looks at a residual: from iterates with a residual of 0.01 to 0.1 it converged in 18 % of
+attempts and this in 93 %, from 0.001 to 0.01 in 54 % and 99 % (40 random worlds, w = 0). The
+variance penalty's Λ is that of the current point, and its change with the trajectory is part of
+the step.
+
+Every step must reduce the residual, shortened a few times if need be; otherwise the attempt ends,
+typed, with nothing lost: SCP goes on from where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slipcar.planner.extremal.certificate import model_for
+from slipcar.planner.extremal.conditions import Conditions
+from slipcar.planner.extremal.maximum_principle import adjoint_of, first_order, scales
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.multipliers import Multipliers
+from slipcar.planner.problem.linearization import Linearization
+from slipcar.planner.problem.model import Model
+from slipcar.planner.status import Status
+
+if TYPE_CHECKING:
+    from slipcar.planner.plan import Plan
+
+Array = np.ndarray
+
+#: Where to start. Of 150 random worlds with turned headings (w = 1), 148 lead to a shot that
+#: converges when it is tried at a residual of 0.2 and again whenever that has halved, 1.1 times
+#: on average and after 9 iterations at the median; all land on the extremal that SCP itself goes
+#: to. Above a residual of one, 9 in 10 attempts fail, and some reach another extremal.
+START_WITHIN, _RETRY = 0.2, 0.5
+#: A step is halved down to this before the attempt is given up, and must reduce the residual by
+#: this part of its length.
+_SHORTEST, _DECREASE = 1.0 / 16.0, 1e-4
+_quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+
+@dataclasses.dataclass(frozen=True)
+class ShotIteration:
+    """A point of the Newton iteration; the first is where it started.
+
+    Attributes:
+        mean: (N, n).
+        controls: (K, m).
+        terminal_multiplier: ν, (q,).
+        residual: largest residual of the conditions, relative to :class:`Scales`.
+        step: length of the step that led here, in (0, 1]; 0 for the first.
+        seconds: since the attempt began.
+    """
+
+    mean: Array
+    controls: Array
+    terminal_multiplier: Array
+    residual: float
+    step: float
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """What became of an attempt.
+
+    Attributes:
+        converged: whether the residual fell to the tolerance. If not, the rest is the last
+            point reached, which is no answer.
+        at: linearisation there; `at.x` (N, n) and `at.u` (K, m) are the trajectory.
+        adjoint: λ_1..λ_K = −p_1..−p_K, (K, n).
+        terminal: ν = −𝔭, (q,).
+        history: every point, the start included.
+        seconds: time of the attempt.
+        attempted: whether the start was near enough for a step to be tried.
+        message: why it ended.
+    """
+
+    converged: bool
+    at: Linearization
+    adjoint: Array
+    terminal: Array
+    history: tuple[ShotIteration, ...]
+    seconds: float
+    attempted: bool
+    message: str
+
+    @property
+    def residual(self) -> float:
+        """The last residual."""
+        return self.history[-1].residual
+
+    @property
+    def residuals(self) -> Array:
+        """Residual at every point, (iterations + 1,)."""
+        return np.array([h.residual for h in self.history])
+
+    @property
+    def iterations(self) -> int:
+        """Newton steps taken."""
+        return len(self.history) - 1
+
+
+@_quiet
+def shoot(
+    model: Model,
+    x: Array,
+    u: Array,
+    terminal: Array,
+    *,
+    adjoint: Array | None = None,
+    variance_weight: float = 1.0,
+    terminal_tolerance: float = 0.0,
+    tolerance: float = 1e-12,
+    max_iterations: int = 10,
+    start_within: float = np.inf,
+) -> Shot:
+    """Newton's method from an SCP iterate; never raises for how it ends.
+
+    Args:
+        model: the problem.
+        x: states, (N, n).
+        u: controls, (K, m).
+        terminal: ν of the sub-problem, (q,).
+        adjoint: λ_1..λ_K of the sub-problem, (K, n); by default the adjoint recursion from ν.
+        variance_weight: w ≥ 0.
+        terminal_tolerance: half-width of the terminal box, 0 for equality.
+        tolerance: largest relative residual to call it converged.
+        max_iterations: at most so many Newton steps.
+        start_within: give up at once if the first residual is larger: an iterate so far away
+            is better improved by SCP.
+    """
+    began = time.perf_counter()
+    start = first_order(model, x, u, variance_weight)
+    if adjoint is None:
+        adjoint = adjoint_of(start, terminal)
+    conditions = Conditions(
+        model, variance_weight, terminal_tolerance, scales(model, start, adjoint)
+    )
+    here = conditions.at(x, u, adjoint, terminal)
+    history: list[ShotIteration] = []
+
+    def record(step: float) -> None:
+        seconds = time.perf_counter() - began
+        lin = here.first.lin
+        history.append(ShotIteration(lin.x, lin.u, here.terminal, here.largest, step, seconds))
+
+    def ended(message: str) -> Shot:
+        return Shot(
+            converged=message == "converged",
+            at=here.first.lin,
+            adjoint=here.adjoint,
+            terminal=here.terminal,
+            history=tuple(history),
+            seconds=time.perf_counter() - began,
+            attempted=history[0].residual <= start_within,
+            message=message,
+        )
+
+    record(0.0)
+    if not here.largest <= start_within:
+        return ended("too far from an extremal to start")
+    for _ in range(max_iterations):
+        if here.largest <= tolerance:
+            break
+        step = conditions.newton(here)
+        if step is None:
+            return ended("the Newton matrix is singular")
+        length = 1.0
+        there = conditions.moved(here, step, length)
+        while not there.norm <= (1.0 - _DECREASE * length) * here.norm:
+            length *= 0.5
+            if length < _SHORTEST:
+                return ended("no step along Newton's direction reduces the residual")
+            there = conditions.moved(here, step, length)
+        here = there
+        record(length)
+    if not here.largest <= tolerance:
+        return ended("not within max_iterations")
+    inside = model.admissible(here.first.lin.u)  # they pass their bounds by rounding errors
+    if (inside != here.first.lin.u).any():
+        here = conditions.at(here.first.lin.x, inside, here.adjoint, here.terminal)
+    return ended("converged")
+
+
+def retry_within(shot: Shot, limit: float) -> float:
+    """Residual at which to shoot again: where this attempt was not even made, the same one.
+
+    Args:
+        shot: that did not converge.
+        limit: what it was started within.
+    """
+    return min(limit, _RETRY * shot.history[0].residual) if shot.attempted else limit
+
+
+def shoot_from(plan: Plan, iteration: int | None = None, **options: Any) -> Shot:
+    """Shoot from an iteration of a plan's history.
+
+    Args:
+        plan: a plan that knows its problem.
+        iteration: index into `plan.history`; None takes the plan itself.
+        **options: `tolerance`, `max_iterations`, `start_within` of :func:`shoot`.
+
+    Raises:
+        ValueError: if the plan does not know its problem.
+        IndexError: if there is no such iteration.
+    """
+    model = model_for(plan)
+    x, u, terminal = plan.mean, plan.controls, -plan.multipliers.terminal
+    if iteration is not None:
+        start = plan.history[iteration]
+        x, u, terminal = start.mean, start.controls, start.terminal_multiplier
+    options.setdefault("variance_weight", plan.options["variance_weight"])
+    options.setdefault("terminal_tolerance", plan.options["terminal_tolerance"])
+    return shoot(model, x, u, terminal, **options)
+
+
+def improved(plan: Plan, shot: Shot) -> Plan:
+    """The plan with a converged shot's trajectory and multipliers in place of its own.
+
+    Raises:
+        ValueError: if the shot did not converge.
+    """
+    if not shot.converged:
+        raise ValueError(f"this shot did not converge ({shot.message}): it improves nothing")
+    at, dt = shot.at, np.diff(plan.times)
+    S = moments.covariance_of(model_for(plan), at)
+    return plan.replace(
+        status=Status.CONVERGED,
+        mean=at.x,
+        controls=at.u,
+        covariance=S,
+        effort=at.effort,
+        obstacle_cost=at.penalty,
+        running_cost=at.running,
+        variance=moments.trace_integral(S, dt),
+        multipliers=Multipliers.of(shot.adjoint, shot.terminal, 0.0, at.A),
+        A=at.A,
+        B=at.B,
+        gains=None,
+        solve_time=plan.solve_time + shot.seconds,
+        message="",
+    )

@@ -1,0 +1,134 @@
+"""How often a controller breaks a constraint: paths of the non-linear equation, counted.
+
+    x_{k+1} = x_k + dt_k b(t_k, x_k, u_k) + √dt_k σ(t_k, x_k) ξ_k,    u_k = control(t_k, x_k)
+
+Euler–Maruyama on the planner's own nodes, from x_0 ~ N(start, Σ_0). Starts and noise are common
+to all controllers: path i of a seed meets the same x_0 and ξ whoever drives and however many paths
+are asked for, so two rates differ by what the controllers do, and a search over plans sees a
+nearly monotone function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from slipcar.planner.options import check_count
+from slipcar.planner.problem.model import Model, Problem, model_of
+
+Array = np.ndarray
+
+#: Paths stepped together: enough to hide Python's overhead, few enough to stay in the cache.
+#: Part of what a seed means: other blocks, other paths.
+BLOCK = 2048
+#: Which stream of a block starts are drawn from.
+_START = 1
+
+
+def violations(
+    problem: Problem,
+    control: Callable[[float, Array], Array],
+    *,
+    episodes: int,
+    seed: int,
+    project: Callable[[Array], Array] | None = None,
+) -> Array:
+    """Which paths break `problem.constraint` at a node 1..N−1.
+
+    Starts are drawn from N(start, start_covariance).
+    A path whose state or constraint is no longer a finite number counts as one that does: nothing
+    can be promised for it.
+
+    Args:
+        problem: with `constraint(t, x)` -> (..., p), violated where > 0.
+        control: (t_k [s], states (batch, n)) -> controls (batch, m) in physical units, or (m,)
+            for all; `OpenLoop(p).control`, for example.
+        episodes: how many paths, ≥ 1.
+        seed: of the Brownian paths, ≥ 0; path i depends on (seed, i) alone.
+        project: applied to the controls before they act, e.g. clipping to the bounds.
+
+    Returns:
+        (episodes,) of bool.
+
+    Raises:
+        TypeError: if the problem lacks a required member.
+        ValueError: if it has no `constraint`, if a function's result has the wrong shape, or for
+            a bad number of episodes or seed.
+    """
+    constraint = getattr(problem, "constraint", None)
+    if constraint is None:
+        raise ValueError(
+            f"{type(problem).__name__} has no constraint(t, x) -> (..., p), violated where > 0: "
+            f"without one there is no risk to measure"
+        )
+    check_count("episodes", episodes)
+    check_count("seed", seed, least=0)
+    model = model_of(problem)
+    drive = control if project is None else lambda t, x: project(control(t, x))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        blocks = [
+            _violated(model, constraint, drive, _generator(seed, b), _starts(model, seed, b))
+            for b in range(-(-episodes // BLOCK))
+        ]
+    return np.concatenate(blocks)[:episodes]
+
+
+def _generator(seed: int, block: int) -> np.random.Generator:
+    # A spawned child, never SeedSequence((seed, block)): the paths of an evaluation come from
+    # there, and a risk verified on the very paths it is later judged by would verify nothing.
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block,)))
+
+
+def _starts(model: Model, seed: int, block: int) -> Array:
+    """x(0) of each path of a block, (BLOCK, n)."""
+    x = np.tile(model.start, (BLOCK, 1))
+    if model.start_covariance.any():
+        # Of a stream of their own: the Brownian paths stay those of a known start.
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block, _START)))
+        values, vectors = np.linalg.eigh(model.start_covariance)
+        x += rng.standard_normal(x.shape) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return x
+
+
+def _violated(
+    model: Model,
+    constraint: Callable[[Array, Array], Array],
+    control: Callable[[float, Array], Array],
+    rng: np.random.Generator,
+    x: Array,
+) -> Array:
+    """Which paths of one block, (BLOCK,), from states x (BLOCK, n).
+
+    Always a whole block: results may round by its shape.
+    """
+    violated = np.zeros(BLOCK, dtype=bool)
+    for k, dt in enumerate(model.dt):
+        t = np.full(BLOCK, model.times[k])  # one for each path: all functions are batched alike
+        u = _controls(control(float(model.times[k]), x), model.control_dim)
+        sigma = model.diffusion(t, x)
+        noise = np.sqrt(dt) * rng.standard_normal((BLOCK, sigma.shape[-1]))
+        x = x + dt * model.drift(t, x, u) + np.einsum("bij,bj->bi", sigma, noise)
+        if not np.isfinite(x.sum()):  # a sum is cheap; only when it is not finite look closer
+            lost = ~np.isfinite(x).all(axis=1)
+            violated |= lost
+            x[lost] = model.start  # any finite state: their verdict stands
+        h = np.asarray(constraint(np.full(BLOCK, model.times[k + 1]), x))
+        if h.ndim != 2 or len(h) != BLOCK:
+            raise ValueError(
+                f"constraint(t, x) must have shape ({BLOCK}, p) for {BLOCK} states, not {h.shape}"
+            )
+        kept = h <= 0.0  # written so that NaN is a violation
+        if not kept.all():
+            violated |= ~kept.all(axis=1)
+    return violated
+
+
+def _controls(u: Array, m: int) -> Array:
+    u = np.asarray(u)
+    if u.shape not in ((m,), (BLOCK, m)):
+        raise ValueError(
+            f"control(t, x) must have shape ({BLOCK}, {m}) for {BLOCK} states, or ({m},) for all "
+            f"of them, not {u.shape}"
+        )
+    return u if u.ndim == 2 else np.broadcast_to(u, (BLOCK, m))

@@ -1,0 +1,259 @@
+"""What the method assumes of a problem's functions, checked on points near the guess.
+
+* shapes: every function answers (K, ...) for K points;
+* b affine in u (paper §2): second differences in u vanish;
+* σ depends on no uncertain state (paper §6.1, "z"), where the variance is charged: a state is
+  uncertain if its start is, if its row of σ is not zero, or if its drift depends on an uncertain
+  one. The adjoint weights of the penalty leave out how σ then spreads with Σ; covariances and
+  expected costs do not (:mod:`.moments`, :mod:`.expected.belief`), and need no such thing;
+* on request, every Jacobian against differences: this finds wrong analytic ones, and complex
+  steps through functions that are not analytic (abs, conj, ...).
+
+Points are the guess and seeded random ones around it; those where the functions are not finite
+are passed over here (along the guess itself they are an error later on).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner.problem.model import Model
+from slipcar.planner.problem.recent import Recent
+
+Array = np.ndarray
+
+_POINTS = 16
+#: Relative to the size of the function: what counts as an exact zero of ∂b/∂x, of ∂σ/∂x, of a
+#: second difference in u; and how near a Jacobian must come to its differences.
+_PATTERN, _SIGMA, _AFFINE, _JACOBIAN = 1e-12, 1e-9, 1e-7, 1e-5
+_quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+
+#: Problems that passed, and what was found out about their diffusion.
+_PASSED = Recent()
+
+
+def check_once(model: Model, x: Array, u: Array, *, charged: bool) -> None:
+    """:func:`check_assumptions`, unless this very (immutable) problem has passed it lately.
+
+    Args:
+        model: the problem.
+        x: states of the guess, (N, n).
+        u: its controls, (N−1, m).
+        charged: whether `variance_weight` is to charge the noise.
+
+    Raises:
+        ValueError: naming the function, the entry and what is assumed of it.
+    """
+    found = _PASSED.get(model.problem)
+    if found is None:
+        found = check_assumptions(model, x, u)
+        _PASSED.keep(model.problem, found)
+    if charged and found:
+        raise ValueError(
+            f"{found}. variance_weight (1 unless told otherwise) charges the noise with σ at the "
+            f"mean, which holds only if σ depends on states that stay deterministic (paper §6.1). "
+            f"Plan with expected=True, feedback=True or risk=..., whose covariance counts what "
+            f"noisy states do to σ, or with variance_weight=0"
+        )
+
+
+@_quiet
+def check_assumptions(model: Model, x: Array, u: Array) -> str:
+    """Shapes and affine controls, near states x (N, n) and controls u.
+
+    Returns:
+        Which entry of the diffusion depends on which uncertain state, and why it is one; empty
+        if none does, as in the paper.
+
+    Raises:
+        ValueError: naming the function, the entry and what is assumed of it.
+    """
+    t, y, v = _points(model, x, u)
+    b, A, sigma, d_sigma = _checked_shapes(model, t, y, v)
+    _check_affine(model, t, y, v, b)
+    return _uncertain_diffusion(model, y, A, sigma, d_sigma)
+
+
+def _points(model: Model, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """A few nodes of the guess, and random points around them: times, states, controls."""
+    K, half = len(u), _POINTS // 2
+    rng = np.random.default_rng(0)
+    k = np.linspace(0, K - 1, half).astype(int)
+    spread_x = 0.1 * (1.0 + np.abs(x[:-1]).max(axis=0))
+    spread_u = 0.1 * (1.0 + np.abs(u).max(axis=0))
+    y = np.concatenate([x[k], x[k] + spread_x * rng.normal(size=(half, x.shape[1]))])
+    v = np.concatenate([u[k], u[k] + spread_u * rng.normal(size=(half, u.shape[1]))])
+    return np.tile(model.times[k], 2), y, model.admissible(v)
+
+
+def _checked_shapes(model: Model, t: Array, x: Array, u: Array) -> tuple[Array, ...]:
+    """b, ∂b/∂x, σ and ∂σ/∂x at the points, after a look at every function's shape.
+
+    A function that ignores its batch, or whose shape depends on the point, is found out.
+    """
+    n, m, P = model.state_dim, model.control_dim, len(t)
+    p, q = len(model.weight), np.shape(model.terminal(x[:1]))[1]
+    b, (A, B) = model.drift(t, x, u), model.drift_jacobian(t, x, u)
+    sigma, d_sigma = model.diffusion(t, x), model.diffusion_jacobian(t, x)
+    d = np.shape(sigma)[-1] if np.ndim(sigma) else 0
+    answers: list[tuple[str, Any, tuple[int, ...]]] = [
+        ("drift(t, x, u)", b, (n,)),
+        ("drift_jacobian(t, x, u)[0]", A, (n, n)),
+        ("drift_jacobian(t, x, u)[1]", B, (n, m)),
+        ("diffusion(t, x)", sigma, (n, d)),
+        ("diffusion_jacobian(t, x)", d_sigma, (n, d, n)),
+        ("penalty(t, x)", model.penalty(t, x), (p,)),
+        ("penalty_jacobian(t, x)", model.penalty_jacobian(t, x), (p, n)),
+        ("terminal(x)", model.terminal(x), (q,)),
+        ("terminal_jacobian(x)", model.terminal_jacobian(x), (q, n)),
+    ]
+    if model.state_cost is not None and model.state_cost_derivatives is not None:
+        gradient, hessian = model.state_cost_derivatives(t, x)
+        answers += [
+            ("state_cost(t, x)", model.state_cost(t, x), ()),
+            ("state_cost_derivatives(t, x)[0]", gradient, (n,)),
+            ("state_cost_derivatives(t, x)[1]", hessian, (n, n)),
+        ]
+    if model.control_cost is not None and model.control_cost_jacobian is not None:
+        answers += [
+            ("control_cost(t, x)", model.control_cost(t, x), (m,)),
+            ("control_cost_jacobian(t, x)", model.control_cost_jacobian(t, x), (m, n)),
+        ]
+    for name, value, shape in answers:
+        if np.shape(value) != (P, *shape):
+            raise ValueError(
+                f"{name} must have shape {(P, *shape)} for {P} points, not {np.shape(value)}"
+            )
+    return np.asarray(b), np.asarray(A), np.asarray(sigma), np.asarray(d_sigma)
+
+
+def _check_affine(model: Model, t: Array, x: Array, u: Array, b: Array) -> None:
+    rng = np.random.default_rng(1)
+    step = (1.0 + np.abs(u)) * rng.uniform(-1.0, 1.0, u.shape)
+    ahead, behind = np.asarray(model.drift(t, x, u + step)), np.asarray(model.drift(t, x, u - step))
+    bend = np.abs(ahead - 2.0 * b + behind)
+    size = np.abs(ahead) + np.abs(b) + np.abs(behind)
+    bent = bend > _AFFINE * (size + size.max(axis=1, keepdims=True)) + 1e-300
+    if bent.any():
+        point, i = (int(j) for j in np.argwhere(bent)[0])
+        raise ValueError(
+            f"drift must be affine in the control (paper §2), but component {i} is not: at "
+            f"x = {_show(x[point])} and u = {_show(u[point])} it bends by {bend[point, i]:.3g} "
+            f"over a step of {_show(step[point])}; make the bent part a state and its rate the "
+            f"control"
+        )
+
+
+def _uncertain_diffusion(model: Model, x: Array, A: Array, sigma: Array, d_sigma: Array) -> str:
+    largest = np.nanmax(np.abs(sigma), initial=0.0)
+    scale = 1.0 + np.abs(x).max(axis=0)
+    moved = (np.abs(d_sigma) * scale > _SIGMA * largest).any(axis=0)  # (n, d, n)
+    if largest == 0.0 or not moved.any():
+        return ""
+    A = np.abs(A) * scale
+    negligible = _PATTERN * A.max(axis=(1, 2), keepdims=True)
+    depends = (negligible < A).any(axis=0)
+    noisy = (sigma != 0.0).any(axis=(0, 2))
+    unknown = np.diag(model.start_covariance) > 0.0
+    path = {int(i): f"noise → x[{i}]" for i in np.flatnonzero(noisy)}
+    path |= {int(i): f"start → x[{i}]" for i in np.flatnonzero(unknown & ~noisy)}
+    fresh = list(path)
+    while fresh:
+        fresh = [
+            _reach(path, int(i), j)
+            for j in fresh
+            for i in np.flatnonzero(depends[:, j])
+            if int(i) not in path
+        ]
+    for j in path:
+        entries = np.argwhere(moved[:, :, j])
+        if len(entries):
+            row, column = (int(i) for i in entries[0])
+            return f"diffusion[{row}, {column}] depends on x[{j}], which is uncertain ({path[j]})"
+    return ""
+
+
+def _reach(path: dict[int, str], i: int, by: int) -> int:
+    path[i] = f"{path[by]} → x[{i}]"
+    return i
+
+
+@_quiet
+def check_derivatives(model: Model, x: Array, u: Array) -> None:
+    """Every Jacobian, analytic or complex-step, against central differences.
+
+    Raises:
+        ValueError: naming the function, the entry and both values.
+    """
+    t, y, v = _points(model, x, u)
+    A, B = model.drift_jacobian(t, y, v)
+    _compare(model, "drift_jacobian", "[0]", A, lambda z: model.drift(t, z, v), y)
+    _compare(model, "drift_jacobian", "[1]", B, lambda z: model.drift(t, y, z), v)
+    _compare(
+        model, "diffusion_jacobian", "", model.diffusion_jacobian(t, y),
+        lambda z: model.diffusion(t, z), y,
+    )  # fmt: skip
+    _compare(
+        model, "penalty_jacobian", "", model.penalty_jacobian(t, y),
+        lambda z: model.penalty(t, z), y,
+    )  # fmt: skip
+    _compare(model, "terminal_jacobian", "", model.terminal_jacobian(y), model.terminal, y)
+    H, derivatives = model.state_cost, model.state_cost_derivatives
+    if H is not None and derivatives is not None:
+        gradient, hessian = derivatives(t, y)
+        name = "state_cost_derivatives"
+        _compare(model, name, "[0]", gradient, lambda z: H(t, z), y)
+        _compare(model, name, "[1]", hessian, lambda z: derivatives(t, z)[0], y)
+    linear, jacobian = model.control_cost, model.control_cost_jacobian
+    if linear is not None and jacobian is not None:
+        _compare(model, "control_cost_jacobian", "", jacobian(t, y), lambda z: linear(t, z), y)
+
+
+def _compare(
+    model: Model, name: str, part: str, given: Any, f: Callable[[Array], Array], x: Array
+) -> None:
+    """Raise where a Jacobian (P, ..., n) is not what differences of f with respect to x are."""
+    given = np.asarray(given)
+    h = 1e-4 * (1.0 + np.abs(x))
+    wide, narrow = _differences(f, x, h), _differences(f, x, 0.5 * h)
+    best = (4.0 * narrow - wide) / 3.0
+    size = np.maximum(np.abs(given), np.abs(best))
+    allowed = _JACOBIAN * (size + _largest(size)) + 10.0 * np.abs(narrow - wide)
+    allowed += 1e-9 * (1.0 + np.nanmax(np.abs(np.asarray(f(x))), initial=0.0))
+    wrong = np.abs(given - best) > allowed
+    if not wrong.any():
+        return
+    index = tuple(int(i) for i in np.argwhere(wrong)[0])
+    analytic = getattr(model.problem, name, None) is not None
+    source = "your function" if analytic else "by complex step"
+    advice = "" if analytic else "; is the function analytic? otherwise give its derivative"
+    raise ValueError(
+        f"{name}{part}{list(index[1:])} ({source}) is {given[index]:.9g} at "
+        f"{_show(x[index[0]])}, but differences give {best[index]:.9g}{advice}"
+    )
+
+
+def _differences(f: Callable[[Array], Array], x: Array, h: Array) -> Array:
+    columns = []
+    for i in range(x.shape[1]):
+        ahead, behind = x.copy(), x.copy()
+        ahead[:, i] += h[:, i]
+        behind[:, i] -= h[:, i]
+        rise = np.asarray(f(ahead)) - np.asarray(f(behind))
+        width = (ahead[:, i] - behind[:, i]).reshape(-1, *[1] * (rise.ndim - 1))
+        columns.append(rise / width)
+    return np.stack(columns, axis=-1)
+
+
+def _largest(size: Array) -> Array:
+    """Largest entry of each point's Jacobian, shaped to broadcast."""
+    axes = tuple(range(1, size.ndim))
+    return np.max(np.nan_to_num(size), axis=axes, keepdims=True, initial=0.0)
+
+
+def _show(values: Array) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"

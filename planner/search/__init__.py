@@ -1,0 +1,1 @@
+"""Over guesses, horizons and prices."""

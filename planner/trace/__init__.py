@@ -1,0 +1,1 @@
+"""Functions to expressions to kernels."""
