@@ -13,16 +13,19 @@
 Importing this package imports neither torch nor Stable-Baselines3.
 """
 
+from slipcar.baselines.cloning_config import CloneConfig
 from slipcar.baselines.config import PPOConfig
 from slipcar.baselines.deterministic import deterministic_scp
-from slipcar.baselines.pathwise import PathwiseConfig, train_pathwise
+from slipcar.baselines.pathwise import train_pathwise
+from slipcar.baselines.pathwise_config import PathwiseConfig
 from slipcar.baselines.policy import Policy
-from slipcar.baselines.ppo import Progress, train_ppo
+from slipcar.baselines.ppo import train_ppo
+from slipcar.baselines.progress import Progress
 from slipcar.baselines.score import Score, score
 from slipcar.baselines.shipped import shipped_methods
 from slipcar.baselines.storage import load_policy, save_policy, shipped_runs
 from slipcar.baselines.straight import straight
-from slipcar.baselines.warm_start import CloneConfig, clone_planner, train_warm_started
+from slipcar.baselines.warm_start import clone_planner, train_warm_started
 
 __all__ = [
     "CloneConfig",

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
+from slipcar.baselines.cloning_config import CloneConfig
 from slipcar.baselines.demonstrations import Demonstrations, demonstrate
 from slipcar.baselines.network import make_network, policy_of
 from slipcar.baselines.policy import Policy
 from slipcar.baselines.session import single_thread
-from slipcar.baselines.warm_start import CloneConfig
 from slipcar.baselines.watch import Watch
 from slipcar.envs.observation import Layout
 from slipcar.envs.sources import Source

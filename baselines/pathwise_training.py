@@ -12,9 +12,9 @@ import torch
 
 from slipcar.baselines.easing import eased
 from slipcar.baselines.network import copy_into, make_network, policy_of
-from slipcar.baselines.pathwise import PathwiseConfig
+from slipcar.baselines.pathwise_config import PathwiseConfig
 from slipcar.baselines.policy import ACTION_DIM, Policy
-from slipcar.baselines.ppo import Progress
+from slipcar.baselines.progress import Progress
 from slipcar.baselines.session import bar_for, single_thread
 from slipcar.baselines.storage import save_policy
 from slipcar.baselines.watch import Watch

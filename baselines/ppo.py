@@ -8,36 +8,16 @@ torch and Stable-Baselines3 are imported when training starts and at no other ti
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
 from slipcar.baselines.checkpoint import describe_run, read_checkpoint
 from slipcar.baselines.config import PPOConfig
 from slipcar.baselines.policy import Policy
-from slipcar.baselines.score import Score
+from slipcar.baselines.progress import Progress
 from slipcar.envs.options import layout_for
 from slipcar.envs.sources import Source, base_of, source_of
 from slipcar.envs.validate import checked_int
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """Where training stands after an iteration.
-
-    Attributes:
-        iteration: how many are done.
-        steps: environment steps done.
-        total_steps: environment steps in all.
-        seconds: training time so far, all sessions together.
-        validation: the last evaluation of this session, if there was one.
-    """
-
-    iteration: int
-    steps: int
-    total_steps: int
-    seconds: float
-    validation: Score | None
 
 
 def train_ppo(

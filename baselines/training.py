@@ -18,7 +18,7 @@ from slipcar.baselines.learner import (
     set_state,
 )
 from slipcar.baselines.policy import Policy
-from slipcar.baselines.ppo import Progress
+from slipcar.baselines.progress import Progress
 from slipcar.baselines.score import Score
 from slipcar.baselines.session import bar_for, single_thread
 from slipcar.baselines.storage import policy_from_tensors, policy_tensors, save_policy

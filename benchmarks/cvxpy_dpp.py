@@ -18,8 +18,8 @@ from contenders import Contender, UnavailableError
 from ours import planner
 
 from slipcar.envs import Scenario
-from slipcar.planner.convex.convexify import Subproblem
-from slipcar.planner.convex.solvers import Solution, failed
+from slipcar.planner.convex.solvers.interface import Solution, failed
+from slipcar.planner.convex.subproblem import Subproblem
 
 
 class DppSolver:

@@ -16,7 +16,7 @@ from contenders import EXACT, Answer, Contender, UnavailableError, stopwatch
 
 from slipcar.envs import Scenario
 from slipcar.planner import Plan, Status, plan
-from slipcar.planner.convex.solvers import make_solver
+from slipcar.planner.convex.solvers.registry import make_solver
 
 #: `plan`'s default, and one for answers as exact as those of the whole-problem solvers.
 DEFAULT_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-6

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -37,11 +37,9 @@ from numpy.typing import ArrayLike
 
 from slipcar.envs.arrays import ARRAYS, FLOATS, Functions, array_namespace, functions_of
 from slipcar.envs.nearest import nearest
-from slipcar.envs.parameters import Parameters
+from slipcar.envs.parameters import Parameters, Task
+from slipcar.envs.transition import proximity
 from slipcar.envs.validate import checked_int
-
-if TYPE_CHECKING:
-    from slipcar.envs.scenario import Scenario
 
 KINDS = ("features", "state", "egocentric")
 #: Names in order, written beside a trained policy's weights and compared when it is loaded.
@@ -195,9 +193,7 @@ def entries(
     return seen + shown, block
 
 
-def observe(
-    scenario: Scenario, kind: str, t: ArrayLike, x: np.ndarray, slots: int = 0
-) -> np.ndarray:
+def observe(scenario: Task, kind: str, t: ArrayLike, x: np.ndarray, slots: int = 0) -> np.ndarray:
     """Observation of the state x at time t.
 
     Args:
@@ -210,8 +206,6 @@ def observe(
     Returns:
         float32, (..., d).
     """
-    from slipcar.envs.transition import proximity
-
     layout = Layout(kind, slots)
     states = x.reshape(-1, x.shape[-1])
     times = np.broadcast_to(np.asarray(t, dtype=np.float64), x.shape[:-1]).reshape(-1)
@@ -235,12 +229,12 @@ def fill(out: np.ndarray, seen: list[Any], block: np.ndarray | None) -> None:
         out[..., told:] = 0.0
 
 
-def observation_space(scenario: Scenario, kind: str, slots: int = 0) -> Box:
+def observation_space(scenario: Task, kind: str, slots: int = 0) -> Box:
     """Bounds of one observation."""
     return Layout(kind, slots).space(scenario.horizon)
 
 
-def decode(scenario: Scenario, observation: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def decode(scenario: Task, observation: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Time and state from an observation of any kind, told apart by its length.
 
     Args:

@@ -1,8 +1,11 @@
-"""The numbers that a step and an observation need, for one scenario or for a fleet of them."""
+"""The numbers that a step and an observation need, for one scenario or for a fleet of them.
+
+They are read from a :class:`Task`, which is what a scenario is to the files that it imports.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from array_api_compat import device
@@ -10,8 +13,90 @@ from array_api_compat import device
 from slipcar.envs.arrays import array_namespace
 from slipcar.envs.integrate import Components
 
-if TYPE_CHECKING:
-    from slipcar.envs.scenario import Scenario
+
+class Task(Protocol):
+    """What steps, observations and routes ask of a scenario.
+
+    :class:`slipcar.envs.scenario.Scenario` is one and says more of each.
+    """
+
+    @property
+    def start(self) -> np.ndarray:
+        """x⁰, (5,)."""
+        ...
+
+    @property
+    def goal(self) -> np.ndarray:
+        """x^f, (5,)."""
+        ...
+
+    @property
+    def goal_weight(self) -> np.ndarray:
+        """Diagonal of W, (5,)."""
+        ...
+
+    @property
+    def horizon(self) -> float:
+        """T [s]."""
+        ...
+
+    @property
+    def dt(self) -> float:
+        """Length of a control interval [s]."""
+        ...
+
+    @property
+    def times(self) -> np.ndarray:
+        """Node times, (N,) [s]."""
+        ...
+
+    @property
+    def obstacles(self) -> np.ndarray:
+        """Rows x, y, radius [m], (k, 3)."""
+        ...
+
+    @property
+    def clearance(self) -> float:
+        """ε [m]."""
+        ...
+
+    @property
+    def obstacle_weight(self) -> float:
+        """λ."""
+        ...
+
+    @property
+    def slip(self) -> np.ndarray:
+        """(α², β²)."""
+        ...
+
+    @property
+    def process(self) -> tuple[tuple[int, float], ...]:
+        """Pairs (component of the state, standard deviation per √s)."""
+        ...
+
+    @property
+    def control_bounds(self) -> np.ndarray | None:
+        """Largest |u|, (2,), or None for unbounded."""
+        ...
+
+    @property
+    def action_scale(self) -> np.ndarray:
+        """Control per unit of action, (2,)."""
+        ...
+
+    @property
+    def row_parameters(self) -> Parameters:
+        """The numbers of a step, for components that are rows of float64."""
+        ...
+
+    def control_power(self, u: Any) -> Any:
+        """‖u‖², (...,)."""
+        ...
+
+    def obstacle_power(self, x: Any) -> Any:
+        """λ Σ_o max(0, c_o)², (...,)."""
+        ...
 
 
 class Parameters(NamedTuple):
@@ -39,7 +124,7 @@ class Parameters(NamedTuple):
     goal_weight: Components
 
     @staticmethod
-    def of(scenario: Scenario) -> Parameters:
+    def of(scenario: Task) -> Parameters:
         """Those of one scenario, as floats."""
         return Parameters(
             dt=float(scenario.dt),
@@ -53,7 +138,7 @@ class Parameters(NamedTuple):
         )
 
     @staticmethod
-    def like(component: Any, scenario: Scenario) -> Parameters:
+    def like(component: Any, scenario: Task) -> Parameters:
         """Those of one scenario, for components of this kind and shape."""
         row = isinstance(component, np.ndarray) and component.ndim == 1
         if row and component.dtype == np.float64:
@@ -63,7 +148,7 @@ class Parameters(NamedTuple):
             return p
         return p.shaped(component, scenario)
 
-    def shaped(self, component: Any, scenario: Scenario) -> Parameters:
+    def shaped(self, component: Any, scenario: Task) -> Parameters:
         """The same with obstacles as columns beside arrays of this kind and shape."""
         xp = array_namespace(component)
         columns = xp.asarray(

@@ -14,12 +14,10 @@ they do not tell in which order a path winds round two obstacles).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from slipcar.envs.scenario import Scenario
+from slipcar.envs.parameters import Task
 
 Array = np.ndarray
 
@@ -33,7 +31,7 @@ _TURNING = 0.5
 _MARGIN, _PUSHES = 1.05, 20
 
 
-def guesses(scenario: Scenario, count: int) -> list[tuple[str, Array, Array]]:
+def guesses(scenario: Task, count: int) -> list[tuple[str, Array, Array]]:
     """Up to `count` routes, the most promising first: label, states (N, 5), controls (N−1, 2).
 
     No two are of the same class and gear. Promising is what costs little as it stands: the
@@ -54,7 +52,7 @@ def guesses(scenario: Scenario, count: int) -> list[tuple[str, Array, Array]]:
     return [(name, x, u) for _, name, x, u in ranked[:count]]
 
 
-def arc(scenario: Scenario, bulge: float) -> tuple[Array, Array]:
+def arc(scenario: Task, bulge: float) -> tuple[Array, Array]:
     """One arc in its nearest gear: states (N, 5), controls (N−1, 2).
 
     Args:
@@ -65,7 +63,7 @@ def arc(scenario: Scenario, bulge: float) -> tuple[Array, Array]:
     return trajectory(scenario, path, _nearest_half_turns(scenario, path, 1)[0])
 
 
-def homotopy_class(scenario: Scenario, states: Array) -> tuple[int, ...]:
+def homotopy_class(scenario: Task, states: Array) -> tuple[int, ...]:
     """Winding number of a path about each obstacle, (k,), counter-clockwise.
 
     Counted from the way that turns the least about that obstacle, so 0 means "on the side where
@@ -78,7 +76,7 @@ def homotopy_class(scenario: Scenario, states: Array) -> tuple[int, ...]:
     return tuple(int(w) for w in _windings(scenario, np.asarray(states)[..., :2]))
 
 
-def trajectory(scenario: Scenario, path: Array, half_turns: int) -> tuple[Array, Array]:
+def trajectory(scenario: Task, path: Array, half_turns: int) -> tuple[Array, Array]:
     """Speeds, headings and controls along node positions: states (N, 5), controls (N−1, 2).
 
     Args:
@@ -106,7 +104,7 @@ def trajectory(scenario: Scenario, path: Array, half_turns: int) -> tuple[Array,
     return x, u
 
 
-def _one_of_each_class(scenario: Scenario) -> tuple[list[str], Array]:
+def _one_of_each_class(scenario: Task) -> tuple[list[str], Array]:
     """Labels and node positions (c, N, 2) of the cheapest curve of each class, pushed clear."""
     bulges, bends = (a.ravel() for a in np.meshgrid(_BULGES, _BENDS, indexing="ij"))
     fan = _fan(scenario, bulges, bends)
@@ -121,7 +119,7 @@ def _one_of_each_class(scenario: Scenario) -> tuple[list[str], Array]:
     return labels, _pushed_clear(scenario, fan[chosen])
 
 
-def _fan(scenario: Scenario, bulges: Array, bends: Array) -> Array:
+def _fan(scenario: Task, bulges: Array, bends: Array) -> Array:
     """The curves at the nodes, (f, N, 2), for harmonics (f,), fastest in the middle."""
     start, goal = scenario.start[:2], scenario.goal[:2]
     along = goal - start
@@ -133,7 +131,7 @@ def _fan(scenario: Scenario, bulges: Array, bends: Array) -> Array:
     return start + s[:, None] * (goal - start) + offset[..., None] * sideways
 
 
-def _pushed_clear(scenario: Scenario, paths: Array) -> Array:
+def _pushed_clear(scenario: Task, paths: Array) -> Array:
     """Paths (c, N, 2) bent out of the discs of radius plus clearance, as smoothly as they were."""
     reach = _MARGIN * (scenario.obstacles[:, 2] + scenario.clearance)
     bent = np.zeros_like(paths)
@@ -146,7 +144,7 @@ def _pushed_clear(scenario: Scenario, paths: Array) -> Array:
     return paths + bent
 
 
-def _windings(scenario: Scenario, paths: Array) -> Array:
+def _windings(scenario: Task, paths: Array) -> Array:
     """Winding numbers (..., k) of positions (..., N, 2)."""
     spokes = paths[..., :, None, :] - scenario.obstacles[:, :2]
     angles = np.arctan2(spokes[..., 1], spokes[..., 0])
@@ -158,7 +156,7 @@ def _windings(scenario: Scenario, paths: Array) -> Array:
     return np.round((swept - least) / (2.0 * np.pi)).astype(int)
 
 
-def _nearest_half_turns(scenario: Scenario, path: Array, count: int) -> list[int]:
+def _nearest_half_turns(scenario: Task, path: Array, count: int) -> list[int]:
     """The gears whose headings along the path are nearest those of both ends."""
     travel = np.diff(path, axis=0)
     direction = np.unwrap(np.arctan2(travel[:, 1], travel[:, 0]))

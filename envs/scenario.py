@@ -18,7 +18,8 @@ import numpy as np
 from array_api_compat import device
 from numpy.typing import ArrayLike
 
-from slipcar.envs import car, cost, worlds
+from slipcar.envs import car, cost, routes, worlds
+from slipcar.envs import observation as layouts
 from slipcar.envs.arrays import array_namespace
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.validate import checked_array, checked_float, checked_int, parsed_object, replaced
@@ -391,14 +392,10 @@ class Scenario:
         One for each homotopy class and gear, the most promising first; see
         :mod:`slipcar.envs.routes`.
         """
-        from slipcar.envs import routes
-
         return routes.guesses(self, count)
 
     def homotopy_class(self, states: np.ndarray) -> tuple[int, ...]:
         """Winding number of a path (N, 5) about each obstacle, (k,); see `envs.routes`."""
-        from slipcar.envs import routes
-
         return routes.homotopy_class(self, states)
 
     # ---------------------------------------------------------------- what a path costs
@@ -430,8 +427,6 @@ class Scenario:
         Raises:
             ValueError: if the last axis fits neither kind.
         """
-        from slipcar.envs import observation as layouts
-
         return layouts.decode(self, observation)
 
     def encode_control(self, u: Any) -> Any:

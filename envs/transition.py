@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 from slipcar.envs import car, cost
 from slipcar.envs.arrays import FLOATS, Functions, array_namespace, functions_of
 from slipcar.envs.integrate import Components, added_up, increments, together
-from slipcar.envs.parameters import Parameters
-from slipcar.envs.scenario import Scenario
+from slipcar.envs.parameters import Parameters, Task
 
 
 class Moved(NamedTuple):
@@ -120,7 +119,7 @@ class Transition:
 
 
 def transition(
-    scenario: Scenario,
+    scenario: Task,
     x: Any,
     u: Any,
     noise: Any,
@@ -148,7 +147,7 @@ def transition(
 
 
 def control_from_action(
-    scenario: Scenario, action: ArrayLike, batch: tuple[int, ...] = ()
+    scenario: Task, action: ArrayLike, batch: tuple[int, ...] = ()
 ) -> np.ndarray:
     """Control in physical units: the action clipped to [−1, 1] times the control bounds.
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import checked_float
 from slipcar.evaluation.cells import Store
+from slipcar.evaluation.comparison_record import ComparisonRecord
 from slipcar.evaluation.controller import Controller, check_controller
 from slipcar.evaluation.executors import open_executor
 from slipcar.evaluation.limits import time_limit
@@ -19,22 +19,14 @@ from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.noise import BLOCK
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
+from slipcar.evaluation.report import comparison as report
 from slipcar.evaluation.rollout import check_counts, evaluate
 from slipcar.evaluation.runs import Runs, trainings
 from slipcar.evaluation.statistics import episodes_for, half_width, rate_interval
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, Row, Swept, message, sweep
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 __all__ = ["Comparison", "compare", "evaluate"]
 
-#: Per-episode metrics whose paired differences against the reference row are shown.
-DIFFERENCES = {
-    "total_difference": "total",
-    "collision_difference": "collision",
-    "between_difference": "touched",
-}
 #: Episodes from which a resolution is turned into a number of episodes, and the most it may ask.
 PILOT, MOST = 8 * BLOCK, 4096 * BLOCK
 
@@ -232,83 +224,22 @@ def _too_wide(results: dict[str, Result], resolution: float) -> list[str]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
-    """Rows of controllers over common Brownian paths; what :func:`compare` returns.
+class Comparison(ComparisonRecord):
+    """What :func:`compare` returns: its record, and ways to write it.
 
-    Attributes:
-        scenario: the world.
-        episodes: a row; the most, where they differ.
-        seed: of the Brownian paths.
-        substeps: Euler–Maruyama steps in each control interval.
-        reference: name of the row that differences are taken against.
-        controllers: name -> controller, in order.
-        results: name -> result, of the rows that finished.
-        errors: name -> message, of the rows that raised.
-        reused: names of the rows that were read from the folder.
-        warnings: what a reader must be told: intervals too wide, work that could not be kept.
-        wall_time: seconds the comparison took.
-        provenance: versions, machine, date, commit.
+    Attributes are those of :class:`slipcar.evaluation.comparison_record.ComparisonRecord`.
     """
-
-    scenario: Scenario
-    episodes: int
-    seed: int
-    substeps: int
-    reference: str
-    controllers: dict[str, Any]
-    results: dict[str, Result]
-    errors: dict[str, str]
-    reused: tuple[str, ...]
-    warnings: tuple[str, ...]
-    wall_time: float
-    provenance: dict[str, Any]
-
-    @functools.cached_property
-    def frame(self) -> pd.DataFrame:
-        """One row a controller, raw numbers in SI units; differences are to `reference`."""
-        import pandas as pd
-
-        rows = {}
-        for name in self.controllers:
-            row: dict[str, Any] = {"error": self.errors.get(name, "")}
-            if name in self.results:
-                row.update(self.results[name].summary())
-                row.update(self._differences(name))
-            rows[name] = row
-        columns = list(dict.fromkeys(key for row in rows.values() for key in row if key != "error"))
-        frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns, "error"])
-        return frame.rename_axis("controller")
-
-    def _differences(self, name: str) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for label, metric in DIFFERENCES.items():
-            mean = low = high = float("nan")
-            if name != self.reference and self.reference in self.results:
-                reference = self.results[self.reference]
-                mean, low, high = self.results[name].difference(reference, metric)
-            found.update({label: mean, f"{label}_low": low, f"{label}_high": high})
-        return found
 
     def to_markdown(self) -> str:
         """Tables in Markdown with what they mean and where they come from."""
-        from slipcar.evaluation.report import comparison as report
-
         return report.markdown(self)
 
     def to_latex(self) -> str:
         """The same as LaTeX (booktabs)."""
-        from slipcar.evaluation.report import comparison as report
-
         return report.latex(self)
-
-    def to_csv(self, path: str | Path | None = None) -> str | None:
-        """Raw numbers as CSV: the text, or None after writing it to `path`."""
-        return self.frame.to_csv(path)
 
     def to_json(self) -> str:
         """Raw numbers, scenario, seed, options, versions and machine."""
-        from slipcar.evaluation.report import comparison as report
-
         return report.json_text(self)
 
     def save(self, folder: str | Path, figures: bool = True) -> list[Path]:
@@ -321,8 +252,6 @@ class Comparison:
         Returns:
             The files written.
         """
-        from slipcar.evaluation.report import comparison as report
-
         return report.save(self, Path(folder), figures)
 
 

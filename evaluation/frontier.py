@@ -12,10 +12,8 @@ them tracked by an LQR, and PPO are single points. All drive over the same Brown
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,39 +23,40 @@ from slipcar.envs.validate import checked_int
 from slipcar.evaluation import makers, rows
 from slipcar.evaluation.compare import Comparison, compare
 from slipcar.evaluation.controller import Controller
+from slipcar.evaluation.frontier_record import (
+    CURVES,
+    FEEDBACK,
+    OPEN_LOOP,
+    RECEDING,
+    SINGLE,
+    FrontierRecord,
+    Point,
+    undominated,
+)
+from slipcar.evaluation.report import frontier as report_frontier
 from slipcar.evaluation.rollout import check_counts
-from slipcar.evaluation.runs import Runs
 from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan
 
-if TYPE_CHECKING:
-    import pandas as pd
+__all__ = [
+    "CURVES",
+    "FEEDBACK",
+    "OPEN_LOOP",
+    "RECEDING",
+    "SINGLE",
+    "Frontier",
+    "Point",
+    "candidates",
+    "checked_prices",
+    "frontier",
+    "point_name",
+    "undominated",
+]
 
 #: Prices of risk by default, of plans and of receding horizons; 0 leaves the risk out.
 PRICES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 RECEDING_PRICES = (0.0, 3.0, 10.0, 30.0)
 #: Episodes a point by default; replanning costs a thousand times what playing a plan does.
 EPISODES, RECEDING_EPISODES = 50_000, 16_384
-#: The methods that have a curve, and the family of all others.
-OPEN_LOOP, FEEDBACK, RECEDING = "open loop", "planned feedback", "receding horizon"
-CURVES = (OPEN_LOOP, FEEDBACK, RECEDING)
-SINGLE = "single point"
-
-
-@dataclasses.dataclass(frozen=True)
-class Point:
-    """One controller of the picture.
-
-    Attributes:
-        name: of its row.
-        method: one of :data:`CURVES`, or :data:`SINGLE`.
-        price: ν [cost per unit of probability]; nan for single points.
-        controller: who drives.
-    """
-
-    name: str
-    method: str
-    price: float
-    controller: Controller | Runs
 
 
 def frontier(
@@ -214,69 +213,17 @@ def checked_prices(name: str, prices: Sequence[float]) -> list[float]:
     return sorted(found)
 
 
-def undominated(rates: np.ndarray, costs: np.ndarray) -> np.ndarray:
-    """Which points are on the Pareto front: no other is as good in both and better in one.
-
-    Args:
-        rates: (n,) of numbers to be small; nan is not on the front and dominates nothing.
-        costs: (n,) likewise.
-
-    Returns:
-        (n,) of bool.
-    """
-    rates, costs = np.asarray(rates, dtype=float), np.asarray(costs, dtype=float)
-    no_worse = (rates[:, None] <= rates) & (costs[:, None] <= costs)
-    better = (rates[:, None] < rates) | (costs[:, None] < costs)
-    return ~(no_worse & better).any(axis=0) & np.isfinite(rates) & np.isfinite(costs)
-
-
 @dataclasses.dataclass(frozen=True)
-class Frontier:
-    """Points over common Brownian paths; what :func:`frontier` returns.
+class Frontier(FrontierRecord):
+    """What :func:`frontier` returns: its record, and ways to write it.
 
-    Attributes:
-        points: in the order of the table.
-        comparison: their results, and where they come from.
-        receding_episodes: a point of the receding horizon; `comparison.episodes` are the others'.
-        notes: what a reader must be told: plans that did not converge, a policy that is missing.
+    Attributes are those of :class:`slipcar.evaluation.frontier_record.FrontierRecord`.
     """
 
-    points: tuple[Point, ...]
     comparison: Comparison
-    receding_episodes: int
-    notes: tuple[str, ...]
-
-    @functools.cached_property
-    def frame(self) -> pd.DataFrame:
-        """One row a point, raw numbers in SI units.
-
-        `effort_front` and `total_front` say whether no other row has at most the same collision
-        rate and cost and less of one: the Pareto fronts, of estimates. Rows over fewer paths than
-        the others are left out of it: luck decides more of theirs.
-        """
-        import pandas as pd
-
-        found: dict[str, dict[str, Any]] = {}
-        for point in self.points:
-            row: dict[str, Any] = {"method": point.method, "price": point.price}
-            result = self.comparison.results.get(point.name)
-            if result is not None:
-                row.update(result.summary())
-            row["error"] = self.comparison.errors.get(point.name, "")
-            found[point.name] = row
-        frame = pd.DataFrame.from_dict(found, orient="index").rename_axis("controller")
-        for cost in ("effort", "total"):
-            frame[f"{cost}_front"] = False
-            if cost in frame:  # not if all rows raised
-                same = frame["episodes"] == self.comparison.episodes
-                rates, costs = frame["collision_rate"].where(same), frame[cost].where(same)
-                frame[f"{cost}_front"] = undominated(rates.to_numpy(), costs.to_numpy())
-        return frame
 
     def to_markdown(self) -> str:
         """The tables in Markdown with what they mean and where they come from."""
-        from slipcar.evaluation.report import frontier as report_frontier
-
         return report_frontier.markdown(self)
 
     def save(self, folder: str | Path, figures: bool = True) -> list[Path]:
@@ -289,6 +236,4 @@ class Frontier:
         Returns:
             The files written.
         """
-        from slipcar.evaluation.report import frontier as report_frontier
-
         return report_frontier.save(self, Path(folder), figures)

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slipcar.evaluation.report.document import Column, Table, table_of
+from slipcar.evaluation.comparison_record import ComparisonRecord
+from slipcar.evaluation.report.table import Column, Table, table_of
 from slipcar.evaluation.rows import FEEDBACK, STEERED, STOCHASTIC
 from slipcar.evaluation.runs import Runs
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from slipcar.evaluation.compare import Comparison
 
 #: Rows whose cost learners are measured by.
 TARGETS = (STOCHASTIC, FEEDBACK, STEERED)
@@ -75,7 +74,7 @@ def _curve(label: str, history: list[dict[str, float]]) -> Curve:
     return Curve(label, *(np.array([float(at[name]) for at in history]) for name in columns))
 
 
-def targets(comparison: Comparison) -> dict[str, tuple[float, float]]:
+def targets(comparison: ComparisonRecord) -> dict[str, tuple[float, float]]:
     """Name -> mean cost and planning time of the plans to be reached, cheapest last.
 
     The paper's plan, the same tracked by an LQR, and planned feedback, as far as there are such
@@ -89,7 +88,7 @@ def targets(comparison: Comparison) -> dict[str, tuple[float, float]]:
     return dict(sorted(found.items(), key=lambda item: -item[1][0]))
 
 
-def frame(comparison: Comparison) -> pd.DataFrame:
+def frame(comparison: ComparisonRecord) -> pd.DataFrame:
     """One line a learned method and plan: what it takes to reach the plan's cost.
 
     Columns: cost, planning_time, runs, reached (how many trainings got there), and of those that
@@ -118,7 +117,7 @@ def frame(comparison: Comparison) -> pd.DataFrame:
     return pd.DataFrame.from_dict(lines, orient="index").rename_axis("learner → plan")
 
 
-def table(comparison: Comparison) -> Table | None:
+def table(comparison: ComparisonRecord) -> Table | None:
     """The printed form of :func:`frame`; None if no row kept a history."""
     numbers = frame(comparison)
     if not len(numbers):

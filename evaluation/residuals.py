@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner import plan
-from slipcar.planner.extremal.certificate import model_for, violations
+from slipcar.planner.extremal.certificate import violations
+from slipcar.planner.extremal.planned import model_for
 from slipcar.planner.extremal.shooting import START_WITHIN, retry_within, shoot_from
 
 Array = np.ndarray

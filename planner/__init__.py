@@ -15,7 +15,7 @@ from slipcar.planner.history import Iteration
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.plan import Plan
 from slipcar.planner.planning import plan
-from slipcar.planner.problem.model import Problem
+from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.receding_horizon import RecedingHorizon
 from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
 from slipcar.planner.search.risk import Risk

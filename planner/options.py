@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.convex.solvers import Solver
+from slipcar.planner.convex.solvers.interface import Solver
 from slipcar.planner.convex.trust_region import TRUST_REGIONS
 from slipcar.planner.history import Iteration
 from slipcar.planner.problem.integrators import INTEGRATORS
@@ -18,7 +18,41 @@ METHODS = ("auto", "newton", "convex")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What an iteration is told; the fields are documented at `slipcar.planner.plan`."""
+    """How an iteration runs.
+
+    Attributes:
+        variance_weight: w ≥ 0 of w ∫ tr Σ dt; 0 is deterministic SCP. In `plan`, None is 1, or 0 with
+            one of `risk`, `risk_price`, `feedback` and `expected`, whose cost counts the noise
+            already. Without one of them, w > 0 asks for a diffusion that depends on no uncertain
+            state.
+        solver: of the convex method: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with
+            their interface; see :mod:`slipcar.planner.convex.solvers`.
+        method: `"newton"`: one LQ problem per iteration and Newton's method at the end, quadratic
+            (:mod:`slipcar.planner.newton`); `"convex"`: the paper's scheme, exact convex
+            sub-problems. `"auto"` takes the first unless an option or the problem asks for the
+            second: another solver, a trust region, the literal linearisation, a terminal box, a
+            ball of controls. Where the first does not converge, the second goes on.
+        tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0; in the
+            units of the controls: choose it for controls that are not of order one.
+        max_iterations: at most so many sub-problems from each guess, ≥ 1; of those beyond 60
+            three quarters are for the convex method, should Newton's not converge.
+        trust_region: of the convex method: `"adaptive"` (None is), `"paper"` (Δ₀ = 100, × 0.99)
+            or `"none"`.
+        linearization: `"composite"` keeps max(0, ·)² and linearises its argument; `"literal"`
+            linearises the obstacle cost whole, as the paper writes it.
+        terminal_tolerance: half-width of a box round E g = 0; 0 asks for equality.
+        integrator: of the mean: `"euler"` (the paper's) or `"rk4"`; controls are constant on each
+            interval either way. See :mod:`slipcar.planner.problem.integrators`.
+        compiled: run Newton's method as machine code. None: where llvmlite is installed; False
+            never compiles, the same steps in NumPy; True insists, and refuses functions that
+            cannot be traced.
+        callback: called with each :class:`Iteration`, from whichever guess and at whichever
+            horizon; returning True stops that guess (all others begin nonetheless) and any search
+            of a final time.
+
+    Raises:
+        ValueError: for a value out of range, naming it.
+    """
 
     variance_weight: float = 1.0
     solver: str | Solver = "structured"
@@ -44,8 +78,6 @@ class Options:
         check_choice("integrator", self.integrator, INTEGRATORS)
         if self.compiled not in (None, True, False):
             raise ValueError(f"compiled must be None, True or False, not {self.compiled!r}")
-        if self.compiled and self.callback is not None:
-            raise ValueError("compiled=True leaves no room for a callback: leave compiled out")
         if self.callback is not None and not callable(self.callback):
             raise ValueError(f"callback must be a function of an Iteration, not {self.callback!r}")
         if not isinstance(self.solver, str) and not hasattr(self.solver, "solve"):
@@ -63,6 +95,12 @@ class Options:
                 f"method='newton' cannot be combined with {self.only_convex}: "
                 f"method='convex' can (or leave method out)"
             )
+
+    def with_iterations(self, limit: int) -> Options:
+        """The same with at most so many iterations; nothing is checked again."""
+        copy = object.__new__(Options)
+        vars(copy).update(vars(self), max_iterations=limit)
+        return copy
 
     @property
     def only_convex(self) -> str:
@@ -92,6 +130,63 @@ class Options:
             "integrator": self.integrator,
             "compiled": self.compiled,
         }
+
+
+@dataclasses.dataclass(frozen=True)
+class Guesses:
+    """Where iterations begin, and which horizons they try.
+
+    Attributes:
+        starts: guesses to try, ≥ 1: the problem's own (with and without its penalties at first) and
+            others round the obstacles; the best plan is returned and `alternatives` says what
+            became of each. None is 1, or 6 for an expected cost: the way round the obstacles that
+            is cheapest for the mean may be the riskiest.
+        guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
+            and controls (N−1, m); None takes the problem's own.
+        cold_start: when the problem's own guess is tried beside `guess` and the better plan
+            returned: `"auto"` unless `guess` is a converged plan that fits the problem at least
+            as well and leads to a converged one, `"always"` or `"never"`. A converged plan is a
+            local optimum, as a rule in its guess's homotopy class; only a comparison tells
+            whether the problem's own guess leads to a better one. `message` says which was taken.
+        free_first: leave the penalties out until the first steps have settled, so that the path
+            that would be best without obstacles decides which way round them, not the guess.
+            None: from the problem's own guess, unless an option asks for the convex method.
+        shooting: once an iterate of the convex method is near an extremal, solve the maximum
+            principle itself by Newton's method, to 1e-12 (paper §3.3); SCP goes on where that
+            fails. `shot` says what became of it.
+        free_final_time: choose the horizon too: minimise cost + time_weight · T over a uniform
+            dilation of the time grid (paper §5); `final_time` and `time_search` say what came out.
+        time_weight: cost of a second of final time, > 0.
+        final_time_bounds: least and largest final time [s], counted from the first node; None is
+            1/10 and 10 times the problem's.
+        check_derivatives: compare every Jacobian with differences before planning.
+
+    Raises:
+        ValueError: for a value out of range, naming it.
+    """
+
+    starts: int | None = None
+    guess: Any = None
+    cold_start: str = "auto"
+    free_first: bool | None = None
+    shooting: bool = False
+    free_final_time: bool = False
+    time_weight: float = 1.0
+    final_time_bounds: tuple[float, float] | None = None
+    check_derivatives: bool = False
+
+    def __post_init__(self) -> None:
+        if self.starts is not None:
+            check_count("starts", self.starts)
+        check_choice("cold_start", self.cold_start, ("auto", "always", "never"))
+        if self.free_first not in (None, True, False):
+            raise ValueError(f"free_first must be None, True or False, not {self.free_first!r}")
+        if (self.starts or 1) > 1 and self.guess is not None:
+            raise ValueError(
+                "starts > 1 and guess exclude each other: starts makes its own guesses"
+            )
+        if self.free_final_time:
+            check_number("time_weight", self.time_weight)
 
 
 def check_choice(name: str, value: Any, known: Iterable[str]) -> None:

@@ -7,21 +7,24 @@ import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from slipcar.planner import plan_file
+from slipcar.planner.extremal.certificate import Certificate, certify
+from slipcar.planner.extremal.shooting import Shot
 from slipcar.planner.history import Iteration
+from slipcar.planner.moments.covariance import trace_integral
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.problem.model import Problem
+from slipcar.planner.newton.running import Steered
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.problem.model import Model, penalty_cost
+from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
 from slipcar.planner.search.risk import Risk
+from slipcar.planner.search.steering import Steering
 from slipcar.planner.status import Status
-
-if TYPE_CHECKING:
-    from slipcar.planner.extremal.certificate import Certificate
-    from slipcar.planner.extremal.shooting import Shot
 
 Array = np.ndarray
 
@@ -99,7 +102,7 @@ class Plan:
 
     @functools.cached_property
     def certificate(self) -> Certificate:
-        """What the plan proves: multipliers and residuals of the maximum principle (SPEC §3.7).
+        """What the plan proves: multipliers and residuals of the maximum principle.
 
         Raises:
             ValueError: if the plan does not know its problem (loaded from a file without it), or
@@ -110,8 +113,6 @@ class Plan:
                 "the certificate is of plans of the mean: leave risk, risk_price, feedback and "
                 "expected out"
             )
-        from slipcar.planner.extremal.certificate import certify
-
         # At its bound the horizon's slope need not vanish.
         bounds = self.options.get("final_time_bounds") or ()
         free = not np.isclose(self.times[-1] - self.times[0], bounds, rtol=1e-9).any()
@@ -145,3 +146,84 @@ class Plan:
             ValueError: if it is no plan, is damaged or has another format.
         """
         return cls(**plan_file.read(path))
+
+
+def steered_plan(
+    steering: Steering,
+    nominal: Outcome,
+    model: Model,
+    problem: Problem,
+    *,
+    guess: Array,
+    options: dict[str, Any],
+    seconds: float,
+    **extras: Any,
+) -> Plan:
+    """A plan of an expected cost, which started from the plan of the mean `nominal`."""
+    of_mean = plan_of(
+        nominal, model, problem, guess=guess, options=options, seconds=seconds, **extras
+    )
+    return of_mean.replace(
+        **steered_fields(steering.plan, model),
+        status=steering.status,
+        iterations=nominal.iterations + steering.iterations,
+        gains=steering.plan.gains if options["feedback"] else None,
+        message=steering.message,
+        expected=steering.cost,
+        risk=steering.risk,
+    )
+
+
+def steered_fields(steered: Steered, model: Model) -> dict[str, Any]:
+    """What a plan takes over from where an iteration on an expected cost ended."""
+    return {
+        "mean": steered.x,
+        "controls": steered.u,
+        "covariance": steered.covariance,
+        "effort": steered.effort,
+        "obstacle_cost": penalty_cost(model, steered.x),
+        "running_cost": steered.running,
+        "variance": trace_integral(steered.covariance, model.dt),
+        "multipliers": Multipliers.of(steered.adjoint, steered.terminal, 0.0, steered.A),
+        "A": steered.A,
+        "B": steered.B,
+    }
+
+
+def plan_of(
+    outcome: Outcome,
+    model: Model,
+    problem: Problem,
+    *,
+    guess: Array,
+    options: dict[str, Any],
+    seconds: float,
+    gains: Array | None = None,
+    **more: Any,
+) -> Plan:
+    """A plan: what `outcome` found for `model`, which completes `problem`, from states `guess`."""
+    return Plan(
+        status=outcome.status,
+        times=model.times,
+        mean=outcome.x,
+        controls=outcome.u,
+        covariance=outcome.covariance,
+        effort=outcome.effort,
+        obstacle_cost=outcome.penalty,
+        running_cost=outcome.running,
+        variance=trace_integral(outcome.covariance, model.dt),
+        iterations=outcome.iterations,
+        history=outcome.history,
+        guess=guess,
+        multipliers=Multipliers.of(
+            outcome.adjoint, outcome.terminal, outcome.trust_multiplier, outcome.A
+        ),
+        A=outcome.A,
+        B=outcome.B,
+        gains=gains,
+        solve_time=seconds,
+        options=options,
+        problem=problem,
+        message=outcome.message,
+        **more,
+    )

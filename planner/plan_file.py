@@ -8,19 +8,16 @@ import os
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.problem.model import Problem
+from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
 from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
-
-if TYPE_CHECKING:
-    from slipcar.planner.plan import Plan
 
 Array = np.ndarray
 
@@ -32,7 +29,7 @@ _SCALARS = (
 )  # fmt: skip
 
 
-def write(plan: Plan, path: str | os.PathLike[str]) -> Path:
+def write(plan: Any, path: str | os.PathLike[str]) -> Path:
     """Write a plan, atomically; see `Plan.save`."""
     path = Path(path)
     if path.suffix != ".npz":

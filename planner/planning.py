@@ -9,18 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.build import build, build_steered
-from slipcar.planner.convex.solvers import Solver
+from slipcar.planner.convex.solvers.interface import Solver
 from slipcar.planner.history import Iteration
-from slipcar.planner.options import Options, check_choice, check_count, check_number
+from slipcar.planner.newton.posing import Posed, check_assumptions, pose
+from slipcar.planner.options import Guesses, Options
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.plan import Plan
+from slipcar.planner.plan import Plan, plan_of, steered_plan
 from slipcar.planner.problem import checks
-from slipcar.planner.problem.model import Problem, model_of
+from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.problem.reposed import reposed
+from slipcar.planner.search.attempt import attempt, uses_newton
 from slipcar.planner.search.free_time import checked_bounds
 from slipcar.planner.search.free_time import free_final_time as search_time
-from slipcar.planner.search.method import solve
 from slipcar.planner.search.shot import solve_shooting
 from slipcar.planner.search.starts import multistart
 from slipcar.planner.search.steering import Request, steer
@@ -63,208 +64,201 @@ def plan(
     check_derivatives: bool = False,
     callback: Callable[[Iteration], bool | None] | None = None,
 ) -> Plan:
-    """Plan by stochastic sequential convex programming (paper §3 and §6, SPEC §3).
+    """Plan by stochastic sequential convex programming (paper §3 and §6).
 
         minimise  ∫ uᵀRu + H(μ) + ℓ(μ)ᵀu + Σ w max(0, c(μ))² + variance_weight · tr Σ dt
 
     Args:
         problem: anything that satisfies :class:`slipcar.planner.Problem`; a Scenario does.
-        variance_weight: w ≥ 0; 0 is deterministic SCP. None is 1, or 0 with one of `risk`,
-            `risk_price`, `feedback` and `expected`, whose cost counts the noise already. Without
-            one of them, w > 0 asks for a diffusion that depends on no uncertain state.
-        solver: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with their interface; see
-            :mod:`slipcar.planner.convex.solvers`.
-        method: `"newton"`: one LQ problem per iteration and Newton's method at the end, quadratic
-            (:mod:`slipcar.planner.newton`); `"convex"`: the paper's scheme, exact convex
-            sub-problems. `"auto"` takes the first unless an option or the problem asks for the
-            second: another solver, a trust region, the literal linearisation, a terminal box, a
-            ball of controls. Where the first does not converge, the second goes on.
-        tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0; in the
-            units of the controls: choose it for controls that are not of order one.
-        max_iterations: at most so many sub-problems from each guess, ≥ 1; of those beyond 60
-            three quarters are for the convex method, should Newton's not converge.
-        trust_region: of the convex method: `"adaptive"` (None is), `"paper"` (Δ₀ = 100, × 0.99)
-            or `"none"`.
-        linearization: `"composite"` keeps max(0, ·)² and linearises its argument; `"literal"`
-            linearises the obstacle cost whole, as the paper writes it.
-        terminal_tolerance: half-width of a box round E g = 0; 0 asks for equality.
-        integrator: of the mean: `"euler"` (the paper's) or `"rk4"`; controls are constant on each
-            interval either way. See :mod:`slipcar.planner.problem.integrators`.
-        compiled: run Newton's method compiled by numba, the same steps to rounding errors. None:
-            where numba is installed and the problem's functions can be traced, and no callback
-            is to be called on the way.
-        starts: guesses to try, ≥ 1: the problem's own (with and without its penalties at first) and
-            others round the obstacles; the best plan is returned and `alternatives` says what
-            became of each. None is 1, or 6 for an expected cost: the way round the obstacles that
-            is cheapest for the mean may be the riskiest.
-        guess: where to start: a plan (resampled if its time grid is another), or states (N, n)
-            and controls (N−1, m); None takes the problem's own.
-        cold_start: when the problem's own guess is tried beside `guess` and the better plan
-            returned: `"auto"` unless `guess` is a converged plan that fits the problem at least
-            as well and leads to a converged one, `"always"` or `"never"`. A converged plan is a
-            local optimum, as a rule in its guess's homotopy class; only a comparison tells
-            whether the problem's own guess leads to a better one. `message` says which was taken.
-        free_first: leave the penalties out until the first steps have settled, so that the path
-            that would be best without obstacles decides which way round them, not the guess.
-            None: from the problem's own guess, unless an option asks for the convex method.
-        shooting: once an iterate of the convex method is near an extremal, solve the maximum
-            principle itself by Newton's method, to 1e-12 (paper §3.3, SPEC §3.8); SCP goes on
-            where that fails. `shot` says what became of it.
-        free_final_time: choose the horizon too: minimise cost + time_weight · T over a uniform
-            dilation of the time grid (paper §5); `final_time` and `time_search` say what came out.
-        time_weight: cost of a second of final time, > 0.
-        final_time_bounds: least and largest final time [s], counted from the first node; None is
-            1/10 and 10 times the problem's.
-        risk: δ in (0, 1): the probability that a path violates `problem.constraint` at any node
-            must not exceed it. The constraint is priced (see `risk_price`) and the price searched
-            for by Monte Carlo on common random numbers; `Plan.risk` holds what was predicted and
-            what `risk_episodes` fresh paths say. Where no price leads there: status
-            RISK_UNREACHABLE, with the plan of least risk found.
-        risk_price: ν ≥ 0: add ν Σ P(violation) over nodes and constraints to the expected cost
-            (Boole's bound; optimal risk allocation). No Monte Carlo: milliseconds.
-        risk_episodes: fresh paths that verify a risk, ≥ 100.
-        feedback: plan u = ū + K (x − μ) with the gains that minimise the expected cost: effort
-            of the corrections included, bounds kept at a standard deviation of them.
-            `Feedback(plan)` plays it.
-        expected: charge the penalties' expectation, E Σ w max(0, c)² for Gaussian states, instead
-            of their value at the mean. With `risk`, `risk_price` and `feedback` it always is.
-        terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0.
-            None: exact, or with `feedback` the problem's `terminal_weight`, if it has one; if not,
-            exact for the mean, and the spread charged 100 tr Cov g.
-        check_derivatives: compare every Jacobian with differences before planning.
-        callback: called with each :class:`Iteration`, from whichever guess and at whichever
-            horizon; returning True stops that guess (all others begin nonetheless) and any search
-            of a final time.
+        variance_weight, solver, method, tolerance, max_iterations, trust_region, linearization,
+            terminal_tolerance, integrator, compiled, callback: how the iteration runs; each is
+            described at :class:`slipcar.planner.options.Options`.
+        starts, guess, cold_start, free_first, shooting, free_final_time, time_weight,
+            final_time_bounds, check_derivatives: where it begins and which horizons it tries; see
+            :class:`slipcar.planner.options.Guesses`.
+        risk, risk_price, risk_episodes, feedback, expected, terminal_weight: what is planned for
+            beyond the mean; see :class:`slipcar.planner.search.steering.Request`.
 
     Returns:
         A plan; look at `status` before using it, and at `message` when it is not CONVERGED.
 
     Raises:
         TypeError: if `problem` lacks a required member.
-        ValueError: for an option or a problem's function out of range, naming it; for a drift
-            that is not affine in the control, or a diffusion that depends on uncertain states
-            where `variance_weight` is to charge the noise.
+        ValueError: for an option or a problem's function out of range, naming it; for functions
+            that can neither be traced nor differentiated, and assumptions that do not hold.
     """
     began = time.perf_counter()
-    if shooting and compiled:
+    request = Request(risk, risk_price, feedback, expected, terminal_weight, risk_episodes)
+    guesses = Guesses(
+        starts, guess, cold_start, free_first, shooting, free_final_time, time_weight,
+        final_time_bounds, check_derivatives,
+    )  # fmt: skip
+    options = _options(request, guesses, variance_weight, method, dict(
+        solver=solver, tolerance=tolerance, max_iterations=max_iterations, compiled=compiled,
+        trust_region=trust_region, linearization=linearization, callback=callback,
+        terminal_tolerance=terminal_tolerance, integrator=integrator,
+    ))  # fmt: skip
+    with np.errstate(all="ignore"):
+        return _Planning(problem, options, request, guesses, began).run()
+
+
+def _options(
+    request: Request, guesses: Guesses, weight: float | None, method: str, others: dict[str, Any]
+) -> Options:
+    """Options of the iteration, those that depend on what is asked for filled in."""
+    if guesses.shooting and others["compiled"]:
         raise ValueError("shooting=True watches each iterate: leave compiled=True out")
-    request = Request(
-        risk=risk,
-        price=risk_price,
-        feedback=feedback,
-        expected=expected,
-        terminal_weight=terminal_weight,
-        episodes=risk_episodes,
-    )
-    if request.wanted and (shooting or free_final_time):
+    if request.wanted and (guesses.shooting or guesses.free_final_time):
         raise ValueError(
             "risk, risk_price, feedback and expected cannot be combined with shooting or "
             "free_final_time"
         )
-    if variance_weight is None:
-        variance_weight = 0.0 if request.wanted else 1.0
-    if shooting and method == "auto":
+    if weight is None:
+        weight = 0.0 if request.wanted else 1.0
+    if guesses.shooting and method == "auto":
         method = "convex"
-    options = Options(
-        variance_weight=variance_weight,
-        solver=solver,
-        method=method,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        trust_region=trust_region,
-        linearization=linearization,
-        terminal_tolerance=terminal_tolerance,
-        integrator=integrator,
-        compiled=compiled,
-        callback=callback,
-    )
-    if starts is None:
-        starts = _STARTS if request.wanted and guess is None else 1
-    check_count("starts", starts)
-    check_choice("cold_start", cold_start, ("auto", "always", "never"))
-    if free_first not in (None, True, False):
-        raise ValueError(f"free_first must be None, True or False, not {free_first!r}")
-    if starts > 1 and guess is not None:
-        raise ValueError("starts > 1 and guess exclude each other: starts makes its own guesses")
-    model = model_of(problem)
-    if integrator != model.integrator:
-        model = dataclasses.replace(model, integrator=integrator)
-    if request.wanted:
-        request.check(options, model)
-    if free_final_time:
-        check_number("time_weight", time_weight)
-        bounds = checked_bounds(model, final_time_bounds)
-    x, u = model.guess() if guess is None else given_guess(model, guess)
-    if check_derivatives:  # before the rest, which relies on them
-        checks.check_derivatives(model, x, u)
-    checks.check_once(model, x, u, charged=options.variance_weight > 0 and not request.wanted)
-    record: dict[str, Any] = {
-        **options.as_dict(),
-        "starts": int(starts),
-        "cold_start": cold_start,
-        "free_first": free_first,
-        "shooting": bool(shooting),
-        "free_final_time": bool(free_final_time),
-        "time_weight": float(time_weight) if free_final_time else None,
-        "final_time_bounds": list(bounds) if free_final_time else None,
-        "risk": risk,
-        "risk_price": risk_price,
-        "risk_episodes": int(risk_episodes),
-        "feedback": bool(feedback),
-        "expected": bool(expected),
-        "terminal_weight": None
-        if terminal_weight is None
-        else np.asarray(terminal_weight, dtype=float).tolist(),
-    }
-    more: dict[str, Any] = {}
-    convex = method == "convex" or bool(options.only_convex)
+    return Options(variance_weight=weight, method=method, **others)
 
-    def run(x: Array, u: Array, *, own: bool = False) -> Outcome:
-        first = own and not convex if free_first is None else free_first
-        if shooting:
-            found, more["shot"] = solve_shooting(model, options, x, u, free_first=first)
-            return found
-        return solve(model, options, x, u, free_first=first)
 
-    candidates: tuple[tuple[Array, Outcome], ...] = ()
-    if starts > 1:
-        tried = multistart(model, options, starts)
-        candidates, more["alternatives"] = tried.different, tried.alternatives
-        x, found = candidates[0]
-        if shooting:
-            found = run(found.x, found.u)
-    elif guess is None:
-        found = run(x, u, own=True)
-    elif cold_start == "never":
-        found = run(x, u)
-    else:
-        trusted = isinstance(guess, Plan) and guess.status.ok and cold_start == "auto"
-        x, found = run_guarded(model, options, run, (x, u), trusted=trusted)
-    if free_final_time:
-        model, found, more["time_search"] = search_time(
-            model, options, found, time_weight=float(time_weight), bounds=bounds
+class _Planning:
+    """One call of `plan`.
+
+    Args:
+        problem: what is planned for.
+        options: of the iterations.
+        request: what is planned for beyond the mean.
+        guesses: where iterations begin.
+        began: when the call did [s].
+    """
+
+    def __init__(
+        self, problem: Problem, options: Options, request: Request, guesses: Guesses, began: float
+    ) -> None:
+        self.problem, self.options, self.request = problem, options, request
+        self.guesses, self.began = guesses, began
+        self.extras: dict[str, Any] = {}
+        model = model_of(problem)
+        if options.integrator != model.integrator:
+            model = dataclasses.replace(model, integrator=options.integrator)
+        self.model: Model = model
+        if request.wanted:
+            request.check(options, model)
+        self.bounds = (
+            checked_bounds(model, guesses.final_time_bounds) if guesses.free_final_time else None
         )
-        problem = reposed(problem, times=model.times)
-    if request.wanted and found.status not in (Status.STOPPED, Status.SOLVER_FAILED):
-        candidates = candidates or ((x, found),)
-        steered = steer(problem, options, request, [outcome for _, outcome in candidates])
-        x, found = candidates[steered.origin]
-        return build_steered(
-            steered,
-            found,
-            model,
-            problem,
-            guess=x,
-            options=record,
-            seconds=time.perf_counter() - began,
-            **more,
+        self.posed: Posed | None = None
+        if uses_newton(model, options):
+            self.posed = pose(model, compiled=options.compiled)
+
+    def run(self) -> Plan:
+        """Check, plan, and put the plan together."""
+        model, guesses = self.model, self.guesses
+        given = guesses.guess
+        x, u = model.guess() if given is None else given_guess(model, given)
+        if guesses.check_derivatives:  # before the rest, which relies on them
+            checks.check_derivatives(model, x, u)
+        charged = self.options.variance_weight > 0 and not self.request.wanted
+        if self.posed is not None:
+            check_assumptions(self.posed, x, u, charged=charged)
+        else:
+            checks.check(model, x, u, None, charged=charged)
+        candidates = self._candidates(x, u)
+        if guesses.free_final_time:
+            candidates = [(candidates[0][0], self._timed(candidates[0][1]))]
+        plan = self._steered(candidates) if self._steers(candidates[0][1]) else self._built(
+            *candidates[0]
+        )  # fmt: skip
+        return self._noted(plan)
+
+    def _candidates(self, x: Array, u: Array) -> list[tuple[Array, Outcome]]:
+        """Outcomes that differ, each with the states of its guess, the best first."""
+        guesses = self.guesses
+        starts = guesses.starts
+        if starts is None:
+            starts = _STARTS if self.request.wanted and guesses.guess is None else 1
+        if starts > 1:
+            tried = multistart(self.model, self.posed, self.options, starts)
+            self.extras["alternatives"] = tried.alternatives
+            best_x, best = tried.different[0]
+            if guesses.shooting:
+                best = self._attempt(best.x, best.u)
+            return [(best_x, best), *tried.different[1:]]
+        if guesses.guess is None:
+            return [(x, self._attempt(x, u, own=True))]
+        if guesses.cold_start == "never":
+            return [(x, self._attempt(x, u))]
+        given = guesses.guess
+        trusted = isinstance(given, Plan) and given.status.ok and guesses.cold_start == "auto"
+        return [run_guarded(self.model, self.options, self._attempt, (x, u), trusted=trusted)]
+
+    def _attempt(self, x: Array, u: Array, *, own: bool = False) -> Outcome:
+        """What one guess leads to; `own`: it is the problem's."""
+        free_first = self.guesses.free_first
+        if free_first is None:
+            convex = self.options.method == "convex" or bool(self.options.only_convex)
+            free_first = own and not convex
+        at = (self.model, self.posed, self.options, x, u)
+        if self.guesses.shooting:
+            outcome, self.extras["shot"] = solve_shooting(*at, free_first=free_first)
+            return outcome
+        return attempt(*at, free_first=free_first)
+
+    def _timed(self, outcome: Outcome) -> Outcome:
+        """The plan at the best horizon."""
+        assert self.bounds is not None
+        self.model, outcome, self.extras["time_search"] = search_time(
+            self.model, self.posed, self.options, outcome,
+            time_weight=float(self.guesses.time_weight), bounds=self.bounds,
+        )  # fmt: skip
+        self.problem = reposed(self.problem, times=self.model.times)
+        return outcome
+
+    def _steers(self, outcome: Outcome) -> bool:
+        ended = outcome.status in (Status.STOPPED, Status.SOLVER_FAILED)
+        return self.request.wanted and not ended
+
+    def _steered(self, candidates: list[tuple[Array, Outcome]]) -> Plan:
+        """The plan of the expected cost that plans of the mean lead to."""
+        steering = steer(
+            self.model, self.options, self.request, [outcome for _, outcome in candidates]
         )
-    return build(
-        found,
-        model,
-        problem,
-        guess=x,
-        options=record,
-        seconds=time.perf_counter() - began,
-        **more,
-    )
+        x, nominal = candidates[steering.origin]
+        return steered_plan(
+            steering, nominal, self.model, self.problem, guess=x, options=self._record(),
+            seconds=time.perf_counter() - self.began, **self.extras,
+        )  # fmt: skip
+
+    def _built(self, x: Array, outcome: Outcome) -> Plan:
+        return plan_of(
+            outcome, self.model, self.problem, guess=x, options=self._record(),
+            seconds=time.perf_counter() - self.began, **self.extras,
+        )  # fmt: skip
+
+    def _noted(self, plan: Plan) -> Plan:
+        """With a word on derivatives that were taken numerically."""
+        names = sorted(self.model.jacobians.differenced) if self.model.knows_jacobians else []
+        if not names:
+            return plan
+        say = f"differentiated numerically, as they cannot be traced: {', '.join(names)}"
+        return plan.replace(message=f"{plan.message}; {say}" if plan.message else say)
+
+    def _record(self) -> dict[str, Any]:
+        """What the plan was asked for, as plain data."""
+        guesses, request = self.guesses, self.request
+        weight = request.terminal_weight
+        return {
+            **self.options.as_dict(),
+            "starts": int(guesses.starts or (_STARTS if request.wanted else 1)),
+            "cold_start": guesses.cold_start,
+            "free_first": guesses.free_first,
+            "shooting": bool(guesses.shooting),
+            "free_final_time": bool(guesses.free_final_time),
+            "time_weight": float(guesses.time_weight) if guesses.free_final_time else None,
+            "final_time_bounds": None if self.bounds is None else list(self.bounds),
+            "risk": request.risk,
+            "risk_price": request.price,
+            "risk_episodes": int(request.episodes),
+            "feedback": bool(request.feedback),
+            "expected": bool(request.expected),
+            "terminal_weight": None if weight is None else np.asarray(weight, float).tolist(),
+        }

@@ -4,7 +4,7 @@ At node k with state x the controller plays the first control of
 
     minimise E[ cost of the intervals left | x_k = x ] over ū and K,   u = ū + K (x − μ)
 
-(:mod:`slipcar.planner.expected`): the expected cost for Gaussian states, given that it
+(:mod:`slipcar.planner.newton.loop`): the expected cost for Gaussian states, given that it
 will go on to correct. A certainty-equivalent replan does not know that the noise to come depends
 on what it chooses; this one does, and a Newton step from the last plan makes it.
 """
@@ -19,12 +19,12 @@ import numpy as np
 
 from slipcar.planner.controllers import OpenLoop
 from slipcar.planner.moments.gains import closed_loop_covariance, wrap
-from slipcar.planner.newton.traced import parameter_row
 from slipcar.planner.options import check_count, check_number
+from slipcar.planner.plan import steered_fields
 from slipcar.planner.planning import plan
-from slipcar.planner.problem.model import Problem, model_of
-from slipcar.planner.search.horizon_batch import Tails
-from slipcar.planner.search.horizon_setup import as_plan, handover_of, replanner, stakes_of
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.problem.protocol import Problem
+from slipcar.planner.search.replanning import Tails, handover_of, replanner, stakes_of
 
 Array = np.ndarray
 
@@ -88,8 +88,7 @@ class RecedingHorizon(OpenLoop):
         tolerance: a replan stops before where two steps together, ∫ ‖Δu‖² dt, are below it, > 0.
         saturation: control bounds are kept at so many standard deviations of the correction, ≥ 0.
         workers: threads that replan, ≥ 1; 0 takes one for each processor.
-        compiled: replan compiled by numba, the same plans to rounding errors. None: where numba is
-            installed and the problem's functions can be traced.
+        compiled: replan by machine code, the same plans to rounding errors; see `plan`.
         handover: the last feedback law takes over where fewer intervals than this are left. None
             is 0 with a `terminal_weight`, else 2 ⌈q/m⌉ + 2 for q terminal conditions and m
             controls: at ⌈q/m⌉ the controls are just enough.
@@ -139,18 +138,26 @@ class RecedingHorizon(OpenLoop):
             )
         if risk is not None and risk_price > 0.0:
             raise ValueError("risk and risk_price exclude each other: risk=δ finds the price")
-        stakes = stakes_of(problem, float(risk_price), float(saturation))
+        stakes = stakes_of(model, float(risk_price), float(saturation))
         self._handover = handover_of(model, stakes, handover)
         price = {"risk": risk} if risk is not None else {"risk_price": float(risk_price) or None}
         first = plan(problem, feedback=True, compiled=compiled, **price)
         if first.risk is not None:
-            stakes = stakes_of(problem, first.risk.price, float(saturation))
+            stakes = stakes_of(model, first.risk.price, float(saturation))
         self._options = (stakes, int(iterations), float(tolerance), int(workers), compiled)
-        self._replanner = replanner(problem, *self._options, guess=(first.mean, first.controls))
-        found = self._replanner.first(first.mean, first.controls, _FIRST)
-        self._first = Tails.of(found)
-        seconds = time.perf_counter() - began
-        super().__init__(as_plan(first, found, model, seconds))
+        self._replanner = replanner(model, *self._options)
+        steered = self._replanner.first(first.mean, first.controls, _FIRST)
+        self._first = Tails.of(steered)
+        super().__init__(
+            first.replace(
+                **steered_fields(steered, model),
+                status=steered.status,
+                iterations=first.iterations + steered.iterations,
+                gains=steered.gains,
+                solve_time=time.perf_counter() - began,
+                message="",
+            )
+        )
         self._angles = tuple(getattr(problem, "angles", ()))
         self.replans, self.failures, self.seconds = 0, 0, 0.0
 
@@ -304,11 +311,11 @@ class RecedingHorizon(OpenLoop):
             stakes.weight,
             stakes.terminal,
             np.array([stakes.saturation, iterations, tolerance, self._handover]),
-            np.array([self._replanner.run is not None]),
+            np.array([self._replanner.posed.native]),
             model.R,
             model.lower,
             model.upper,
-            parameter_row(model.problem),
+            self._replanner.posed.numbers,
         ]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -317,8 +324,7 @@ class RecedingHorizon(OpenLoop):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        guess = (self.plan.mean, self.plan.controls)
-        self._replanner = replanner(self.plan.problem, *self._options, guess=guess)
+        self._replanner = replanner(model_of(self.plan.problem), *self._options)
 
 
 def _unwrapped(x: Array, mean: Array, angles: tuple[int, ...]) -> Array:

@@ -11,14 +11,20 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from slipcar.evaluation import rows
 from slipcar.evaluation.figures.labels import Label, place
 from slipcar.evaluation.figures.scene import INK, PALETTE, PAPER, new_figure, save_figure, style
-from slipcar.evaluation.frontier import CURVES, FEEDBACK, OPEN_LOOP, RECEDING
+from slipcar.evaluation.frontier_record import (
+    CURVES,
+    FEEDBACK,
+    OPEN_LOOP,
+    RECEDING,
+    FrontierRecord,
+    Point,
+)
 from slipcar.evaluation.statistics import CONFIDENCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from slipcar.evaluation.frontier import Frontier, Point
     from slipcar.evaluation.metrics import Result
 
     Shown = tuple[Point, Result]
@@ -44,7 +50,7 @@ _READING = (
 )
 
 
-def frontier_figure(frontier: Frontier) -> Figure:
+def frontier_figure(frontier: FrontierRecord) -> Figure:
     """Effort, and total cost, against collision rate, with 95 % intervals of all.
 
     Filled markers are closed loop, hollow ones open loop; a rate of which nothing was observed is

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from slipcar.evaluation.comparison_record import ComparisonRecord
 from slipcar.evaluation.figures.scene import GREY, INK, PALETTE, new_figure, style
 from slipcar.evaluation.learning import Curve, curves, targets
 
@@ -14,13 +15,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from slipcar.evaluation.compare import Comparison
-
 #: Costs above this many times the cheapest plan's are beyond the axes.
 _HIGHEST = 2.0
 
 
-def learning_figure(comparison: Comparison) -> Figure:
+def learning_figure(comparison: ComparisonRecord) -> Figure:
     """Median and range of the trainings' validation costs; plans are level lines."""
     learned, plans = curves(comparison.controllers), targets(comparison)
     with style():

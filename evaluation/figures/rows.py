@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from slipcar.evaluation.comparison_record import ComparisonRecord
 from slipcar.evaluation.figures.scene import PALETTE, PAPER, new_figure, style
 from slipcar.evaluation.statistics import CONFIDENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from slipcar.evaluation.compare import Comparison
     from slipcar.evaluation.metrics import Result
 
 #: More than there are colours, so that no two rows look the same.
@@ -28,7 +28,7 @@ OFF_AXES = 5.0
 _MOST_DRAWN = 2000
 
 
-def _looks(comparison: Comparison) -> dict[str, dict[str, Any]]:
+def _looks(comparison: ComparisonRecord) -> dict[str, dict[str, Any]]:
     """Colour, marker and label of each finished row; filled and solid where the loop is closed."""
     results = comparison.results
     cheapest = min(result.total for result in results.values())
@@ -52,7 +52,7 @@ def _off_axes_label(label: str, result: Result) -> str:
     return f"{label}, off the axes:\ncost {cost}, collisions {result.collision_rate:.1%}"
 
 
-def tradeoff_figure(comparison: Comparison) -> Figure:
+def tradeoff_figure(comparison: ComparisonRecord) -> Figure:
     """Total cost against collision rate, with 95 % intervals of both."""
     with style():
         figure = new_figure(8.8, 4.3)
@@ -117,7 +117,7 @@ def _plain_log_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def distributions_figure(comparison: Comparison) -> Figure:
+def distributions_figure(comparison: ComparisonRecord) -> Figure:
     """How the cost of a path is distributed: its distribution function, and its tail."""
     with style():
         figure = new_figure(9.0, 3.9)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from slipcar.evaluation.comparison_record import ComparisonRecord
 from slipcar.evaluation.figures.learning import learning_figure
 from slipcar.evaluation.figures.plan import covariance_figure, iterations_figure
 from slipcar.evaluation.figures.rows import distributions_figure, tradeoff_figure
@@ -12,9 +13,6 @@ from slipcar.evaluation.figures.scene import paths_figure, save_figure, style
 from slipcar.evaluation.learning import curves
 from slipcar.evaluation.report.scene import illustrated
 from slipcar.evaluation.rollout import sample_paths
-
-if TYPE_CHECKING:
-    from slipcar.evaluation.compare import Comparison
 
 __all__ = [
     "covariance_figure",
@@ -32,7 +30,7 @@ __all__ = [
 SHOWN_PATHS, MEASURED_PATHS = 100, 4096
 
 
-def save_all(comparison: Comparison, folder: Path) -> list[Path]:
+def save_all(comparison: ComparisonRecord, folder: Path) -> list[Path]:
     """Draw every figure of a comparison; returns the files written (PNG, PDF, SVG)."""
     written = []
     _, plan = illustrated(comparison)

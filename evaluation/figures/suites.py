@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from slipcar.evaluation.metrics import Result
-    from slipcar.evaluation.suites.suite import SuiteResult
+    from slipcar.evaluation.suites.records import SuiteResult
 
 #: Marks that tell rows apart without colour.
 _MARKERS = "osD^vPX*ph"

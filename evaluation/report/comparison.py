@@ -12,15 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from slipcar.evaluation import learning
 from slipcar.evaluation.cells import controller_fingerprint
-from slipcar.evaluation.report.document import (
-    Column,
-    Document,
-    Figure,
-    Table,
-    plain,
-    table_of,
-    write_texts,
-)
+from slipcar.evaluation.comparison_record import ComparisonRecord
+from slipcar.evaluation.report.document import Document, Figure, plain, write_texts
 from slipcar.evaluation.report.formats import (
     collisions,
     difference,
@@ -28,13 +21,12 @@ from slipcar.evaluation.report.formats import (
     number,
     with_error,
 )
+from slipcar.evaluation.report.table import Column, Table, table_of
 from slipcar.evaluation.runs import Runs
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
-
-    from slipcar.evaluation.compare import Comparison
 
 LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
 TOTAL = Column("total cost", with_error("total"), "total")
@@ -110,7 +102,7 @@ FIGURES = {
 }
 
 
-def tables(comparison: Comparison, brief: bool = False) -> tuple[Table, ...]:
+def tables(comparison: ComparisonRecord, brief: bool = False) -> tuple[Table, ...]:
     """The printed tables, in order."""
     captioned: list[tuple[str, tuple[Column, ...]]] = [
         (
@@ -151,7 +143,7 @@ def tables(comparison: Comparison, brief: bool = False) -> tuple[Table, ...]:
     return (*done, table_of(frame, caption, WORK))
 
 
-def training_frame(frame: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
+def training_frame(frame: pd.DataFrame, comparison: ComparisonRecord) -> pd.DataFrame:
     """Rows of which several trainings were driven, each followed by its trainings."""
     import pandas as pd
 
@@ -178,7 +170,7 @@ def training_frame(frame: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
     return pd.DataFrame(rows, index=index)
 
 
-def frames(frame: pd.DataFrame, comparison: Comparison) -> dict[str, pd.DataFrame]:
+def frames(frame: pd.DataFrame, comparison: ComparisonRecord) -> dict[str, pd.DataFrame]:
     """Raw numbers by file: `table`, which is the same wherever it is computed, and `times`."""
     import pandas as pd
 
@@ -195,7 +187,7 @@ def frames(frame: pd.DataFrame, comparison: Comparison) -> dict[str, pd.DataFram
     return named
 
 
-def setting(comparison: Comparison, fewer: bool = True) -> str:
+def setting(comparison: ComparisonRecord, fewer: bool = True) -> str:
     """A sentence on what was run.
 
     Args:
@@ -214,14 +206,14 @@ def setting(comparison: Comparison, fewer: bool = True) -> str:
     )
 
 
-def messages(comparison: Comparison) -> tuple[str, ...]:
+def messages(comparison: ComparisonRecord) -> tuple[str, ...]:
     """What a reader must be told: the comparison's notes, and rows that failed."""
     errors = comparison.errors.items()
     return (*comparison.warnings, *(f"{name} did not finish: {text}" for name, text in errors))
 
 
 def document(
-    comparison: Comparison,
+    comparison: ComparisonRecord,
     *,
     title: str = "Comparison",
     notes: tuple[str, ...] = (),
@@ -247,22 +239,22 @@ def document(
     )
 
 
-def markdown(comparison: Comparison) -> str:
+def markdown(comparison: ComparisonRecord) -> str:
     """Tables in Markdown with their captions, notes and provenance."""
     return document(comparison).markdown()
 
 
-def latex(comparison: Comparison) -> str:
+def latex(comparison: ComparisonRecord) -> str:
     r"""Tables in LaTeX; they need `\usepackage{booktabs}`."""
     return document(comparison).latex()
 
 
-def terminal(comparison: Comparison) -> Group:
+def terminal(comparison: ComparisonRecord) -> Group:
     """Tables for a terminal, to be printed by a rich console."""
     return document(comparison, brief=True).terminal()
 
 
-def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
+def json_text(comparison: ComparisonRecord, frame: pd.DataFrame | None = None) -> str:
     """Everything needed to repeat the table, and its raw numbers, as JSON.
 
     Args:
@@ -292,7 +284,7 @@ def json_text(comparison: Comparison, frame: pd.DataFrame | None = None) -> str:
 
 
 def save(
-    comparison: Comparison,
+    comparison: ComparisonRecord,
     folder: Path,
     figures: bool,
     *,
@@ -308,7 +300,7 @@ def save(
         return plots.save_all(comparison, folder)
 
     shown = document(comparison, title=title, notes=notes)
-    written = write_texts(folder, {"results.json": comparison.to_json()})
+    written = write_texts(folder, {"results.json": json_text(comparison)})
     draw_if_wanted = draw if figures else None
     return written + save_document(
         shown, folder, draw_if_wanted, FIGURES, lambda: scene(comparison)

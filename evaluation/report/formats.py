@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from slipcar.evaluation.report.document import NONE
+from slipcar.evaluation.report.table import NONE
 
 
 def with_error(key: str, digits: int = 3) -> Callable[[Any], str]:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipcar.evaluation.frontier import CURVES, RECEDING
+from slipcar.evaluation.frontier_record import CURVES, RECEDING, FrontierRecord
 from slipcar.evaluation.report import comparison as report
-from slipcar.evaluation.report.document import Column, Document, table_of, write_texts
+from slipcar.evaluation.report.document import Document, write_texts
 from slipcar.evaluation.report.formats import collisions, with_error
+from slipcar.evaluation.report.table import Column, table_of
 
 if TYPE_CHECKING:
     from rich.console import Group
-
-    from slipcar.evaluation.frontier import Frontier
 
 COLUMNS = (
     report.LOOP,
@@ -35,7 +34,7 @@ FIGURES = {
 }
 
 
-def setting(frontier: Frontier) -> str:
+def setting(frontier: FrontierRecord) -> str:
     """A sentence or two on what was run."""
     told = report.setting(frontier.comparison, fewer=False)
     fewer = frontier.receding_episodes < frontier.comparison.episodes
@@ -44,7 +43,7 @@ def setting(frontier: Frontier) -> str:
     return told
 
 
-def document(frontier: Frontier) -> Document:
+def document(frontier: FrontierRecord) -> Document:
     """What a frontier has to show; figure and scene are added by :func:`save`."""
     return Document(
         kind="frontier",
@@ -58,17 +57,17 @@ def document(frontier: Frontier) -> Document:
     )
 
 
-def markdown(frontier: Frontier) -> str:
+def markdown(frontier: FrontierRecord) -> str:
     """Tables in Markdown with notes and provenance."""
     return document(frontier).markdown()
 
 
-def terminal(frontier: Frontier) -> Group:
+def terminal(frontier: FrontierRecord) -> Group:
     """Tables for a terminal, to be printed by a rich console."""
     return document(frontier).terminal()
 
 
-def save(frontier: Frontier, folder: Path, figures: bool) -> list[Path]:
+def save(frontier: FrontierRecord, folder: Path, figures: bool) -> list[Path]:
     """Write the tables, the JSON, what a report needs, and the figure; see `Frontier.save`."""
     from slipcar.evaluation.report.scene import scene
 
@@ -92,7 +91,7 @@ def save(frontier: Frontier, folder: Path, figures: bool) -> list[Path]:
     )
 
 
-def driven(frontier: Frontier) -> list[str]:
+def driven(frontier: FrontierRecord) -> list[str]:
     """Rows of the animation: the cheap and the dear end of each curve, and all single points."""
     ends: list[str] = []
     for method in CURVES:

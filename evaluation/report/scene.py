@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from slipcar.envs.scenario import Scenario
+from slipcar.evaluation.comparison_record import ComparisonRecord
 from slipcar.evaluation.rollout import sample_paths
 from slipcar.evaluation.runs import Runs
-
-if TYPE_CHECKING:
-    from slipcar.evaluation.compare import Comparison
 
 #: Brownian paths of the animation: the first of the evaluation's.
 PATHS = 12
@@ -23,7 +21,7 @@ _AT_ONCE = 4
 
 
 def scene(
-    comparison: Comparison, names: Sequence[str] | None = None, paths: int = PATHS
+    comparison: ComparisonRecord, names: Sequence[str] | None = None, paths: int = PATHS
 ) -> dict[str, Any]:
     """Plain data for the animations of a report.
 
@@ -61,7 +59,7 @@ def scene(
     }
 
 
-def iterates(comparison: Comparison) -> dict[str, Any] | None:
+def iterates(comparison: ComparisonRecord) -> dict[str, Any] | None:
     """The iterates that led to the illustrated plan; None if no row has a plan with a history."""
     name, plan = illustrated(comparison)
     if plan is None:
@@ -81,7 +79,7 @@ def iterates(comparison: Comparison) -> dict[str, Any] | None:
     return {"name": name, "guess": guess is not None, "steps": steps}
 
 
-def illustrated(comparison: Comparison) -> tuple[str, Any | None]:
+def illustrated(comparison: ComparisonRecord) -> tuple[str, Any | None]:
     """The row whose plan is shown, and the plan: the reference's, else the first that has one."""
     for name in (comparison.reference, *comparison.controllers):
         plan = getattr(comparison.controllers[name], "plan", None)

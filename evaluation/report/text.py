@@ -6,12 +6,36 @@ import csv
 import io
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from slipcar.evaluation.report.document import Document, Table
+from slipcar.evaluation.report.table import Table
 
 if TYPE_CHECKING:
     from rich.console import Group
+
+
+class Printed(Protocol):
+    """What is printed of a :class:`slipcar.evaluation.report.document.Document`."""
+
+    @property
+    def setting(self) -> str:
+        """A sentence or two on what was run."""
+        ...
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """In order."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader must be told."""
+        ...
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Versions, machine, date, commit."""
+        ...
 
 
 def machine(provenance: Mapping[str, Any]) -> str:
@@ -27,7 +51,7 @@ def machine(provenance: Mapping[str, Any]) -> str:
     return ", ".join(parts) + "." if parts else ""
 
 
-def markdown(document: Document) -> str:
+def markdown(document: Printed) -> str:
     """Tables in Markdown with their captions, notes and provenance."""
     parts = [prose(document.setting)] if document.setting else []
     for table in document.tables:
@@ -78,7 +102,7 @@ def _markdown(text: str) -> str:
     return re.sub(special, lambda found: "".join(rf"\{letter}" for letter in found[0]), line)
 
 
-def latex(document: Document) -> str:
+def latex(document: Printed) -> str:
     r"""Floating tables in LaTeX; they need `\usepackage{booktabs}`."""
     remarks = [document.setting, machine(document.provenance), *document.notes]
     parts = [f"% {' '.join(remark.split())}" for remark in remarks if remark]
@@ -134,7 +158,7 @@ def tex(text: str) -> str:
     return "".join(_TEX.get(letter, letter) for letter in text)
 
 
-def terminal(document: Document) -> Group:
+def terminal(document: Printed) -> Group:
     """Tables for a terminal, to be printed by a rich console."""
     from rich.console import Group
     from rich.text import Text

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.evaluation.metrics import Result
-from slipcar.evaluation.reproduction.reproduce import PAPER_EPISODES, Reproduction
+from slipcar.evaluation.reproduction.record import PAPER_EPISODES, ReproductionRecord
 from slipcar.evaluation.reproduction.runs import PLANS, Rate, trace_integral
 from slipcar.evaluation.reproduction.variants import (
     iterations_needed,
@@ -103,7 +103,7 @@ def trace_norm(plan: Plan) -> float:
     return max(float(np.sqrt(np.sum(np.diff(plan.times) * trace**2))) for trace in traces)
 
 
-def claims(r: Reproduction) -> list[Claim]:
+def claims(r: ReproductionRecord) -> list[Claim]:
     """All of them, in the order of the paper."""
     return [*_scheme(r), *_problem(r), *_results(r)]
 
@@ -112,12 +112,12 @@ def _verdict(good: bool) -> str:
     return REPRODUCED if good else DIFFERS
 
 
-def _between_paths(r: Reproduction, good: bool) -> str:
+def _between_paths(r: ReproductionRecord, good: bool) -> str:
     """Verdict on how paths differ: a single one does not."""
     return _verdict(good) if r.moments.paths > 1 else NOT_RUN
 
 
-def _scheme(r: Reproduction) -> Iterator[Claim]:
+def _scheme(r: ReproductionRecord) -> Iterator[Claim]:
     """§6.1 and §6.2."""
     s, run, moments = r.scenario, r.runs["ours"], r.moments
     found = run.plan
@@ -183,7 +183,7 @@ def _scheme(r: Reproduction) -> Iterator[Claim]:
     yield from _solvers(r)
 
 
-def _solvers(r: Reproduction) -> Iterator[Claim]:
+def _solvers(r: ReproductionRecord) -> Iterator[Claim]:
     others = {name: told for name, told in r.solvers.items() if name != "structured"}
     ran = {name: told for name, told in others.items() if "difference" in told}
     missing = [name for name in others if name not in ran]
@@ -200,7 +200,7 @@ def _solvers(r: Reproduction) -> Iterator[Claim]:
     )
 
 
-def _problem(r: Reproduction) -> Iterator[Claim]:
+def _problem(r: ReproductionRecord) -> Iterator[Claim]:
     """§6.3."""
     s, run = r.scenario, r.runs["ours"]
     printed: dict[str, Any] = {
@@ -269,7 +269,7 @@ def _problem(r: Reproduction) -> Iterator[Claim]:
     )
 
 
-def _results(r: Reproduction) -> Iterator[Claim]:
+def _results(r: ReproductionRecord) -> Iterator[Claim]:
     """§6.4 and its figure."""
     s, run = r.scenario, r.runs["ours"]
     found = run.plan

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from slipcar.evaluation.reproduction.claims import percent
-from slipcar.evaluation.reproduction.reproduce import Reproduction
+from slipcar.evaluation.reproduction.record import ReproductionRecord
 from slipcar.evaluation.reproduction.runs import PLANS, trace_integral
 from slipcar.evaluation.reproduction.variants import (
     iterations_needed,
@@ -45,12 +45,12 @@ class Discrepancy:
     value: float
 
 
-def discrepancies(r: Reproduction) -> list[Discrepancy]:
+def discrepancies(r: ReproductionRecord) -> list[Discrepancy]:
     """All of them, in the order of SPEC §2, and the stopping rule."""
     return [*_cost(r), _covariance(r), *_search(r)]
 
 
-def _cost(r: Reproduction) -> Iterator[Discrepancy]:
+def _cost(r: ReproductionRecord) -> Iterator[Discrepancy]:
     s, ours = r.scenario, r.runs["ours"]
     runs = r.runs
     mine = percent(ours.result)
@@ -106,7 +106,7 @@ def _cost(r: Reproduction) -> Iterator[Discrepancy]:
     )
 
 
-def _covariance(r: Reproduction) -> Discrepancy:
+def _covariance(r: ReproductionRecord) -> Discrepancy:
     s, mean = r.scenario, r.runs["ours"].plan.mean
     exact = r.runs["ours"].plan.variance
     text = trace_integral(text_covariance(s, mean), s.dt)
@@ -123,7 +123,7 @@ def _covariance(r: Reproduction) -> Discrepancy:
     )
 
 
-def _search(r: Reproduction) -> Iterator[Discrepancy]:
+def _search(r: ReproductionRecord) -> Iterator[Discrepancy]:
     s, ours, runs = r.scenario, r.runs["ours"], r.runs
     trusted = runs["paper's trust region"].plan
     widest = max(iterate.trust_radius for iterate in trusted.history)

@@ -18,7 +18,8 @@ from slipcar.evaluation.figures.scene import (
     save_figure,
     style,
 )
-from slipcar.evaluation.reproduction.claims import PAPER_EPISODES, PAPER_RATE
+from slipcar.evaluation.reproduction.claims import PAPER_RATE
+from slipcar.evaluation.reproduction.record import PAPER_EPISODES, ReproductionRecord
 from slipcar.evaluation.reproduction.runs import played
 from slipcar.evaluation.reproduction.tables import covariances
 from slipcar.evaluation.rollout import sample_paths
@@ -27,8 +28,6 @@ from slipcar.evaluation.statistics import wilson_interval
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from slipcar.evaluation.reproduction.reproduce import Reproduction
 
 #: Paths of the paper's figure; points and probability of an ellipse; late iterates that are shown.
 _PATHS, _POINTS, _MASS, _LATE = 100, 73, 0.95, 20
@@ -40,7 +39,7 @@ _LOOKS: tuple[dict[str, Any], ...] = (
 )
 
 
-def save_all(r: Reproduction, folder: Path) -> list[Path]:
+def save_all(r: ReproductionRecord, folder: Path) -> list[Path]:
     """Draw and write every figure; returns the files."""
     ours = r.runs["ours"].plan
     states, _ = sample_paths(played(ours, r.scenario), r.scenario, _PATHS, r.seed)
@@ -57,7 +56,7 @@ def save_all(r: Reproduction, folder: Path) -> list[Path]:
     return written
 
 
-def variants_figure(r: Reproduction) -> Figure:
+def variants_figure(r: ReproductionRecord) -> Figure:
     """Iterates: ours, the literal linearisation's, and those with the potential as printed."""
     shown = (
         ("ours", "L kept convex-composite"),
@@ -87,7 +86,7 @@ def variants_figure(r: Reproduction) -> Figure:
     return figure
 
 
-def covariance_figure(r: Reproduction) -> Figure:
+def covariance_figure(r: ReproductionRecord) -> Figure:
     """Ellipses of the position along the mean path, and tr Σ over time, by each step."""
     s, mean = r.scenario, r.runs["ours"].plan.mean
     nodes = np.linspace(0, s.nodes - 1, 6).round().astype(int)[1:]
@@ -109,7 +108,7 @@ def covariance_figure(r: Reproduction) -> Figure:
     return figure
 
 
-def clearance_figure(r: Reproduction) -> Figure:
+def clearance_figure(r: ReproductionRecord) -> Figure:
     """Collision rate against the clearance a plan was made with, and the paper's."""
     clearances = np.array(list(r.sweep))
     rates = 100 * np.array([result.collision_rate for result in r.sweep.values()])

@@ -8,20 +8,18 @@ gives its number again.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.compare import evaluate
-from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.provenance import provenance
+from slipcar.evaluation.reproduction.record import PAPER_EPISODES, ReproductionRecord
 from slipcar.evaluation.reproduction.runs import (
     CLEARANCES,
     PLANS,
     SWEEP,
-    Agreement,
-    PathMoments,
     Rate,
     Run,
     backends,
@@ -36,37 +34,16 @@ from slipcar.planner import plan
 if TYPE_CHECKING:
     from slipcar.evaluation.report.document import Document
 
-#: Paths that a rate is measured on, and those of the paper.
-EPISODES, PAPER_EPISODES = 100_000, 10_000
+#: Paths that a rate is measured on.
+EPISODES = 100_000
 
 
 @dataclasses.dataclass(frozen=True)
-class Reproduction:
-    """What :func:`reproduce` computed.
+class Reproduction(ReproductionRecord):
+    """What :func:`reproduce` returns: its record, and ways to write it.
 
-    Attributes:
-        scenario: the paper's.
-        episodes: a run.
-        seed: of the Brownian paths, common to all.
-        runs: by the names of :data:`slipcar.evaluation.reproduction.runs.PLANS`.
-        paper: our plan on as many paths as the paper drove.
-        moments: of our plan's paths.
-        sweep: clearance [m] -> what the plan with it does.
-        agreement: with the reference arrays, by part; empty without the file.
-        solvers: see :func:`slipcar.evaluation.reproduction.runs.backends`.
-        provenance: versions, machine, date, commit.
+    Attributes are those of :class:`slipcar.evaluation.reproduction.record.ReproductionRecord`.
     """
-
-    scenario: Scenario
-    episodes: int
-    seed: int
-    runs: Mapping[str, Run]
-    paper: Result
-    moments: PathMoments
-    sweep: Mapping[float, Rate]
-    agreement: Mapping[str, Agreement]
-    solvers: Mapping[str, Mapping[str, Any]]
-    provenance: Mapping[str, Any]
 
     def document(self, figures: bool = True) -> Document:
         """Everything as tables, with or without the figures that :meth:`save` draws."""

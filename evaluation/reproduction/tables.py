@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from slipcar.evaluation.report.document import NONE, Document, Figure, Table
+from slipcar.evaluation.report.document import Document, Figure
 from slipcar.evaluation.report.scene import scene
+from slipcar.evaluation.report.table import NONE, Table
 from slipcar.evaluation.reproduction.claims import NOT_RUN, REPRODUCED, Claim, claims, percent
 from slipcar.evaluation.reproduction.discrepancies import Discrepancy, discrepancies
+from slipcar.evaluation.reproduction.record import ReproductionRecord
 from slipcar.evaluation.reproduction.runs import played, trace_integral
 from slipcar.evaluation.reproduction.variants import (
     released_covariance,
     stopping_values,
     text_covariance,
 )
-
-if TYPE_CHECKING:
-    from slipcar.evaluation.reproduction.reproduce import Reproduction
 
 TITLE = "The paper, claim by claim"
 #: Stem -> caption.
@@ -38,7 +37,7 @@ FIGURES = {
 ANIMATED = ("ours", "clearance 0.1", "printed potential", "literal")
 
 
-def document(r: Reproduction, figures: bool) -> Document:
+def document(r: ReproductionRecord, figures: bool) -> Document:
     """Everything, as plain data."""
     told, differing = claims(r), discrepancies(r)
     missing = [claim.name for claim in told if claim.verdict == NOT_RUN]
@@ -65,14 +64,14 @@ def document(r: Reproduction, figures: bool) -> Document:
 class _Shown:
     """Some of the plans as the rows of a comparison, for the animation of a report."""
 
-    def __init__(self, r: Reproduction) -> None:
+    def __init__(self, r: ReproductionRecord) -> None:
         runs = {name: r.runs[name] for name in ANIMATED}
         self.scenario, self.seed, self.substeps, self.reference = r.scenario, r.seed, 1, ANIMATED[0]
         self.controllers = {name: played(run.plan, r.scenario) for name, run in runs.items()}
         self.results = {name: run.result for name, run in runs.items()}
 
 
-def setting(r: Reproduction, told: Sequence[Claim]) -> str:
+def setting(r: ReproductionRecord, told: Sequence[Claim]) -> str:
     """What was run, and the sum of it."""
     verdicts = [claim.verdict for claim in told]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
@@ -102,7 +101,7 @@ def discrepancies_table(differing: Sequence[Discrepancy]) -> Table:
     )
 
 
-def runs_table(r: Reproduction) -> Table:
+def runs_table(r: ReproductionRecord) -> Table:
     """Every plan, and what its paths do."""
     rows, values = [], []
     for name, run in r.runs.items():
@@ -121,7 +120,7 @@ def runs_table(r: Reproduction) -> Table:
     return Table("The plans behind it", headers, tuple(rows), tuple(values))
 
 
-def covariances(r: Reproduction) -> dict[str, np.ndarray]:
+def covariances(r: ReproductionRecord) -> dict[str, np.ndarray]:
     """Σ at every node, (N, 5, 5), by step."""
     s, mean = r.scenario, r.runs["ours"].plan.mean
     return {
@@ -132,7 +131,7 @@ def covariances(r: Reproduction) -> dict[str, np.ndarray]:
     }
 
 
-def covariance_table(r: Reproduction) -> Table:
+def covariance_table(r: ReproductionRecord) -> Table:
     """∫ tr Σ dt and the deviations at the end, by step."""
     rows, values = [], []
     for name, covariance in covariances(r).items():
@@ -150,12 +149,12 @@ def covariance_table(r: Reproduction) -> Table:
     return Table(caption, headers, tuple(rows), tuple(values))
 
 
-def _spread(r: Reproduction, covariance: np.ndarray) -> tuple[float, ...]:
+def _spread(r: ReproductionRecord, covariance: np.ndarray) -> tuple[float, ...]:
     deviations = np.sqrt(np.maximum(np.diagonal(covariance[-1])[:3], 0.0))
     return trace_integral(covariance, r.scenario.dt), *map(float, deviations)
 
 
-def _agreement_table(r: Reproduction) -> tuple[Table, ...]:
+def _agreement_table(r: ReproductionRecord) -> tuple[Table, ...]:
     if not r.agreement:
         return ()
     rows, values = [], []
@@ -176,7 +175,7 @@ def _agreement_table(r: Reproduction) -> tuple[Table, ...]:
     return (Table(caption, headers, tuple(rows), tuple(values)),)
 
 
-def _times_table(r: Reproduction) -> Table:
+def _times_table(r: ReproductionRecord) -> Table:
     rows, values = [], []
     for solver, told in r.solvers.items():
         seconds = told.get("seconds")
@@ -212,7 +211,7 @@ def _texts(
 
 
 def frames(
-    r: Reproduction, told: Sequence[Claim], differing: Sequence[Discrepancy]
+    r: ReproductionRecord, told: Sequence[Claim], differing: Sequence[Discrepancy]
 ) -> dict[str, pd.DataFrame]:
     """Raw numbers by name; `times` alone differs from run to run."""
     runs = {

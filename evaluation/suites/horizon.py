@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.learned import learned_rows
 from slipcar.evaluation.makers import Maker
-from slipcar.evaluation.report.document import Column, Document, Figure, table_of
+from slipcar.evaluation.report.document import Document, Figure
+from slipcar.evaluation.report.table import Column, table_of
+from slipcar.evaluation.suites.records import Suite, SuiteResult, Variant
 from slipcar.evaluation.suites.shared import frames, notes
-from slipcar.evaluation.suites.suite import Suite, SuiteResult, Variant
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,10 +14,11 @@ import numpy as np
 from slipcar.envs.families import Family
 from slipcar.evaluation.learned import learned_rows
 from slipcar.evaluation.makers import Maker
-from slipcar.evaluation.report.document import Column, Document, Figure, table_of
+from slipcar.evaluation.report.document import Document, Figure
 from slipcar.evaluation.report.formats import with_error, with_interval
+from slipcar.evaluation.report.table import Column, table_of
 from slipcar.evaluation.statistics import bca_interval, standard_error, wilson_interval
-from slipcar.evaluation.suites.suite import Suite, SuiteResult, Variant
+from slipcar.evaluation.suites.records import Suite, SuiteResult, Variant
 
 if TYPE_CHECKING:
     import pandas as pd

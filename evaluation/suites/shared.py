@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from slipcar.evaluation.suites.suite import TIMES, SuiteResult
+from slipcar.evaluation.suites.records import TIMES, SuiteResult
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,8 +1,7 @@
 """What steps are judged by, from the multipliers λ, ν of the sub-problem at hand.
 
-The merit function that steps are judged by is
-
-    Φ = effort + penalty + running cost + w ∫ tr Σ dt + Σ λᵀf + ½ max|λ| ‖f‖₁ + νᵀg + ½ max|ν| ‖g‖₁
+    Φ = cost + λᵀf + ½ max|λ| ‖f‖₁ + νᵀg + ½ max|ν| ‖g‖₁,
+    cost = effort + penalty + running cost + w ∫ tr Σ dt
 
 with f the defects of the non-linear dynamics, g the terminal residual (beyond its tolerance) and
 λ, ν their multipliers from the sub-problem. Pricing them by multipliers, with their signs, is
@@ -17,8 +16,7 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.convex.convexify import Subproblem
-from slipcar.planner.convex.solvers import Solution
+from slipcar.planner.convex.solvers.interface import Solution
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model
@@ -41,9 +39,11 @@ class Iterate:
     lin: Linearization
     variance: moments.Variance | None
 
-    def variance_value(self) -> float:
-        """Return w ∫ tr Σ dt, but for what the start's covariance adds: steps hold that."""
-        return 0.0 if self.variance is None else self.variance.value
+    @property
+    def smooth_cost(self) -> float:
+        """Effort, running cost and w ∫ tr Σ dt but for the start's part of it: steps hold that."""
+        variance = 0.0 if self.variance is None else self.variance.value
+        return self.lin.effort + self.lin.running + variance
 
 
 @_quiet
@@ -63,70 +63,56 @@ def variance_of(model: Model, lin: Linearization, weight: float) -> moments.Vari
     return moments.variance_penalty(weight, lin.sigma, d_sigma, Lambda, model.dt, start)
 
 
-@_quiet
-def merit(at: Iterate, found: Solution, tolerance: float, rho: float) -> float:
-    """Φ with the multipliers of the sub-problem at hand; see the module's docstring."""
-    lin = at.lin
-    beyond = lin.g - np.clip(lin.g, -tolerance, tolerance)
-    price = 0.5 * float(np.max(np.abs(found.adjoint)))
-    nu, size = found.terminal, float(np.max(np.abs(found.terminal), initial=0.0))
-    lacking = size > 0.5 * rho
-    terminal = 0.0 if lacking else np.vdot(nu, beyond)
-    terminal += (rho if lacking else 0.5 * size) * np.abs(beyond).sum()
-    return (
-        lin.effort
-        + lin.penalty
-        + lin.running
-        + at.variance_value()
-        + float(np.vdot(found.adjoint, lin.defect) + price * np.abs(lin.defect).sum())
-        + float(terminal)
-    )
+class Merit:
+    """Φ with the multipliers of one solution.
 
-
-@_quiet
-def lagrangian(at: Iterate, found: Solution, tolerance: float) -> float:
-    """The augmented Lagrangian with the multipliers of the sub-problem at hand.
-
-    Near a solution defects are of second order in the step, as is its gain: the absolute values
-    in the merit function would hide how the cost really curves, the squares here do not.
+    Args:
+        solution: of the sub-problem.
+        tolerance: τ of its terminal box.
+        rho: ρ of its terminal penalty.
     """
-    lin = at.lin
-    beyond = lin.g - np.clip(lin.g, -tolerance, tolerance)
-    size = 1.0 + float(np.max(np.abs(lin.x)))
-    price = 100.0 * float(np.max(np.abs(found.adjoint))) / size
-    return (
-        lin.effort
-        + lin.penalty
-        + lin.running
-        + at.variance_value()
-        + float(np.vdot(found.adjoint, lin.defect) + np.vdot(found.terminal, beyond))
-        + 0.5 * price * float(np.vdot(lin.defect, lin.defect) + np.vdot(beyond, beyond))
-    )
+
+    def __init__(self, solution: Solution, tolerance: float, rho: float) -> None:
+        self.adjoint, self.terminal, self.tolerance = solution.adjoint, solution.terminal, tolerance
+        self._largest = float(np.abs(solution.adjoint).max())
+        size = float(np.abs(solution.terminal).max(initial=0.0))
+        lacking = size > 0.5 * rho
+        self._nu = np.zeros_like(solution.terminal) if lacking else solution.terminal
+        self._terminal_price = rho if lacking else 0.5 * size
+
+    @_quiet
+    def __call__(self, at: Iterate) -> float:
+        """Φ at an iterate."""
+        lin, beyond = at.lin, self._beyond(at.lin.g)
+        defects = np.vdot(self.adjoint, lin.defect) + 0.5 * self._largest * np.abs(lin.defect).sum()
+        end = np.vdot(self._nu, beyond) + self._terminal_price * np.abs(beyond).sum()
+        return at.smooth_cost + lin.penalty + float(defects) + float(end)
+
+    @_quiet
+    def lagrangian(self, at: Iterate) -> float:
+        """The augmented Lagrangian.
+
+        Near a solution defects are of second order in the step, as is its gain: the absolute
+        values in Φ would hide how the cost really curves, the squares here do not.
+        """
+        lin, beyond = at.lin, self._beyond(at.lin.g)
+        price = 50.0 * self._largest / (1.0 + float(np.abs(lin.x).max()))
+        squares = price * (np.vdot(lin.defect, lin.defect) + np.vdot(beyond, beyond))
+        prices = np.vdot(self.adjoint, lin.defect) + np.vdot(self.terminal, beyond)
+        return at.smooth_cost + lin.penalty + float(prices + squares)
+
+    def _beyond(self, g: Array) -> Array:
+        return g - np.minimum(np.maximum(g, -self.tolerance), self.tolerance)
 
 
-@_quiet
-def model_merit(
-    model: Model, at: Iterate, sub: Subproblem, found: Solution, *, composite: bool
-) -> float:
-    """Merit of the step by the convex model: no defects, the trust region's term left out."""
-    u = at.lin.u + found.e
-    value = float(np.vdot(model.dt[:, None] * u, u @ model.R))
-    value += sub.rho * sub.virtual_control(found.d) + at.lin.running
-    if at.lin.q_running is not None:
-        value += float(np.vdot(at.lin.q_running, found.d))
-    if at.lin.Q_running is not None:
-        value += 0.5 * float(np.einsum("ki,kij,kj", found.d, at.lin.Q_running, found.d))
-    if at.lin.r_running is not None:
-        value += float(np.vdot(at.lin.r_running, found.e))
-    if at.variance is not None:
-        d = found.d[:-1]
-        value += at.variance.value + float(np.sum(at.variance.gradient[1:] * d))
-        value += 0.5 * float(np.einsum("ki,kij,kj", d, at.variance.hessian[1:], d))
-    if composite:
-        c = np.maximum((sub.a @ found.d[..., None])[..., 0] + sub.b, 0.0)
-        value += 0.5 * float(np.vdot(sub.h, c * c))
-    else:
-        value += at.lin.penalty
-        slope = 2.0 * model.dt[:, None] * model.weight * np.maximum(at.lin.c, 0.0)
-        value += float(np.einsum("kp,kpn,kn", slope, at.lin.C, found.d))
-    return value
+def model_merit(at: Iterate, solution: Solution, trust_cost: float, *, composite: bool) -> float:
+    """Φ of the step by the convex model, which leaves no defects.
+
+    Args:
+        at: the iterate.
+        solution: of the sub-problem there.
+        trust_cost: what the trust region adds to its objective.
+        composite: whether the sub-problem holds the penalties themselves, or their changes.
+    """
+    constant = at.smooth_cost + (0.0 if composite else at.lin.penalty)
+    return constant + solution.objective - trust_cost

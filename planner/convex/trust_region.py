@@ -1,4 +1,4 @@
-"""How far a step may go: multipliers of E∫‖x − x_k‖² ≤ Δ (paper §3.1, SPEC §3.4).
+"""How far a step may go: multipliers of E∫‖x − x_k‖² ≤ Δ (paper §3.1, §6.4).
 
 The constraint enters the sub-problem through its multiplier (−p¹ of the paper) as a quadratic
 penalty, which every backend takes; the radius a multiplier stands for is what its step
@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Protocol
 
+#: Of the free steps so many are taken within the control bounds.
+_WITHIN_BOUNDS = 10
 #: Relative accuracy of the merit function and of its decrease by the model.
 _MERIT_NOISE = 1e-8
 #: Beyond this a step is as short as it can be, and rounding errors take over.
@@ -38,77 +39,36 @@ class Step:
     before: float
 
 
-class TrustRegion(Protocol):
-    """A schedule of trust regions.
+class TrustRegion:
+    """A schedule of trust regions; as it stands every step is taken whole.
 
     Attributes:
+        multiplier: weight to solve the next sub-problem with.
+        bold: whether the next step may be long and is not judged; control bounds may then wait.
+        collapsed: whether no acceptable step is to be expected any more.
         limits_radius: whether `fits` looks at the radius, which must then be measured in full
             even while the multiplier is zero.
-        bold: whether the next step may be long and is not judged; control bounds may then wait.
         accelerates: whether steps may be lengthened or combined where they converge slowly.
     """
 
-    limits_radius: bool
-    accelerates: bool
-
-    @property
-    def bold(self) -> bool:
-        """Whether the next step may be long and is not judged."""
-        ...
-
-    @property
-    def multiplier(self) -> float:
-        """Weight to solve the next sub-problem with."""
-        ...
+    multiplier, bold, collapsed = 0.0, False, False
+    limits_radius, accelerates = False, False
 
     def cautious(self, multiplier: float) -> TrustRegion | None:
         """A fresh schedule for a second attempt whose steps are short from the first, if any."""
-        ...
+        return None
 
     def fits(self, radius: float) -> bool:
         """Whether a step of this size is allowed; otherwise solve again with a new multiplier."""
-        ...
-
-    def judge(self, step: Step) -> bool:
-        """Accept or reject, and adapt."""
-        ...
-
-    @property
-    def collapsed(self) -> bool:
-        """Whether no acceptable step is to be expected any more."""
-        ...
-
-
-class NoTrustRegion:
-    """Every step is taken whole."""
-
-    limits_radius = False
-    multiplier = 0.0
-    bold = False  # the control bounds are to act from the first step
-    accelerates = False
-
-    @property
-    def collapsed(self) -> bool:
-        """Whether a step was refused: there is no shorter one to try."""
-        return self._refused
-
-    def __init__(self) -> None:
-        self._refused = False
-
-    def cautious(self, multiplier: float) -> None:
-        """There is no such schedule."""
-
-    def fits(self, radius: float) -> bool:
-        """Always."""
         return True
 
     def judge(self, step: Step) -> bool:
-        """Accept whatever is finite."""
-        self._refused = not step.actual > -float("inf")
-        return not self._refused
+        """Accept or reject, and adapt; here whatever is finite is accepted."""
+        self.collapsed = not step.actual > -float("inf")  # there is no shorter step to try
+        return not self.collapsed
 
 
-class PaperTrustRegion:
+class PaperTrustRegion(TrustRegion):
     """Δ_{k+1} = 0.99 Δ_k from Δ_0 = 100, every step accepted (paper §6.4).
 
     The multiplier that makes the step fit is found by bracketing and bisection on its
@@ -116,22 +76,10 @@ class PaperTrustRegion:
     """
 
     limits_radius = True
-    bold = False
-    accelerates = False
 
     def __init__(self, radius: float = 100.0, shrink: float = 0.99) -> None:
         self.radius, self.shrink = radius, shrink
-        self.multiplier = 0.0
         self._low, self._high = 0.0, float("inf")
-        self._refused = False
-
-    @property
-    def collapsed(self) -> bool:
-        """Whether a step was refused: the schedule is fixed and knows no shorter one."""
-        return self._refused
-
-    def cautious(self, multiplier: float) -> None:
-        """There is no such schedule."""
 
     def fits(self, radius: float) -> bool:
         """Whether the step keeps Δ (to 1 %, from inside); moves the multiplier if not.
@@ -158,11 +106,10 @@ class PaperTrustRegion:
         """Accept whatever is finite and shrink the radius."""
         self.radius *= self.shrink
         self.multiplier, self._low, self._high = 0.0, 0.0, float("inf")
-        self._refused = not step.actual > -float("inf")
-        return not self._refused
+        return super().judge(step)
 
 
-class AdaptiveTrustRegion:
+class AdaptiveTrustRegion(TrustRegion):
     """Ratio of actual to predicted decrease of a merit function (as in SCvx and GuSTO).
 
     The multiplier is adapted directly. The first `free` steps are taken whole: the plain
@@ -171,31 +118,22 @@ class AdaptiveTrustRegion:
     rises when one is rejected or barely pays and falls after good ones.
     """
 
-    limits_radius = False
     accelerates = True
 
     def __init__(self, free: int = 25, patience: int = 30, multiplier: float = 0.0) -> None:
-        self.multiplier = multiplier
+        self.multiplier, self.bold = multiplier, free > _WITHIN_BOUNDS
         self._free, self._patience, self._was_free = free, patience, free > 0
         self._rejected = 0
-
-    @property
-    def bold(self) -> bool:
-        """Whether free steps are left, but for a few that are taken within bounds."""
-        return self._free > 10
 
     def cautious(self, multiplier: float) -> AdaptiveTrustRegion | None:
         """Every step judged, the first with this multiplier; None if these already were."""
         return AdaptiveTrustRegion(0, self._patience, multiplier) if self._was_free else None
 
-    def fits(self, radius: float) -> bool:
-        """Always: the multiplier already shaped the step."""
-        return True
-
     def judge(self, step: Step) -> bool:
         """Accept or reject, and adapt the multiplier."""
         finite = step.actual > -float("inf")
         self._free -= 1
+        self.bold = self._free > _WITHIN_BOUNDS
         if self._free >= 0 and finite:
             return True
         # The multiplier that makes the penalty as large as what the step promised.
@@ -203,14 +141,15 @@ class AdaptiveTrustRegion:
         # At the end rounding errors are all that is left of both: no reason to change anything.
         noise = _MERIT_NOISE * (1.0 + abs(step.before))
         if finite and step.predicted <= noise and step.actual >= -noise:
-            self._rejected = 0
+            self._rejected, self.collapsed = 0, False
             return True
         ratio = step.actual / max(step.predicted, 1e-300)
         if not finite or ratio < 1e-3:
             self._rejected += 1
+            self.collapsed = self._rejected > self._patience
             self.multiplier = max(4.0 * self.multiplier, 0.5 * natural) or 1.0
             return False
-        self._rejected = 0
+        self._rejected, self.collapsed = 0, False
         if ratio > 0.7:
             self.multiplier /= 4.0
             if self.multiplier < _NEGLIGIBLE * natural:
@@ -219,15 +158,10 @@ class AdaptiveTrustRegion:
             self.multiplier *= 2.0
         return True
 
-    @property
-    def collapsed(self) -> bool:
-        """Whether too many steps in a row were rejected."""
-        return self._rejected > self._patience
-
 
 #: Constructors by name.
 TRUST_REGIONS: dict[str, Callable[[], TrustRegion]] = {
     "adaptive": AdaptiveTrustRegion,
     "paper": PaperTrustRegion,
-    "none": NoTrustRegion,
+    "none": TrustRegion,
 }

@@ -1,4 +1,4 @@
-"""What a plan proves: its multipliers and the residuals of the maximum principle (SPEC §3.7).
+"""What a plan proves: its multipliers and the residuals of the maximum principle.
 
 The iteration promises (Theorems 3.3 and 3.4) that what it accumulates at satisfies the maximum
 principle of the *non-linear* problem, if p⁰_k ≠ 0 all along. Both are checked here afterwards,
@@ -11,7 +11,6 @@ optimum: the maximum principle is necessary, not sufficient.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,12 +23,10 @@ from slipcar.planner.extremal.maximum_principle import (
     scales,
     time_slope,
 )
+from slipcar.planner.extremal.planned import Planned, model_for
 from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.problem.model import Model
 from slipcar.planner.status import Status
-
-if TYPE_CHECKING:
-    from slipcar.planner.plan import Plan
 
 Array = np.ndarray
 
@@ -79,8 +76,7 @@ class Violations:
     @property
     def largest(self) -> float:
         """The largest of them."""
-        values = np.array(list(self.relative.values()))
-        return float(values.max()) if np.isfinite(values).all() else np.inf
+        return _worst(self.relative)
 
 
 @_quiet
@@ -169,17 +165,16 @@ class Certificate:
     @property
     def residuals(self) -> dict[str, float]:
         """Every residual relative to its scale."""
-        found = self.violations.relative
-        found["adjoint equation"] = self.adjoint_difference / self.violations.scales.adjoint
+        relative = self.violations.relative
+        relative["adjoint equation"] = self.adjoint_difference / self.violations.scales.adjoint
         if self.transversality is not None:
-            found["transversality"] = abs(self.transversality) / self.cost_rate
-        return found
+            relative["transversality"] = abs(self.transversality) / self.cost_rate
+        return relative
 
     @property
     def residual(self) -> float:
         """The largest relative residual; inf if one is not finite."""
-        values = np.array(list(self.residuals.values()))
-        return float(values.max()) if np.isfinite(values).all() else np.inf
+        return _worst(self.residuals)
 
     @property
     def extremal(self) -> bool:
@@ -227,7 +222,7 @@ class Certificate:
 
 @_quiet
 def certify(
-    plan: Plan, *, tolerance: float = 1e-2, time_weight: float | None = None
+    plan: Planned, *, tolerance: float = 1e-2, time_weight: float | None = None
 ) -> Certificate:
     """Check a plan against the maximum principle; never raises for how the plan ended.
 
@@ -244,19 +239,19 @@ def certify(
     """
     if not (np.isfinite(tolerance) and tolerance > 0.0):
         raise ValueError(f"tolerance must be finite and > 0, not {tolerance!r}")
-    model = model_for(plan)
-    weight = plan.options["variance_weight"]
+    model, own, weight = model_for(plan), plan.multipliers, plan.options["variance_weight"]
     at = first_order(model, plan.mean, plan.controls, weight)
-    own = plan.multipliers
-    found = _violations(model, at, -own.terminal, plan.options["terminal_tolerance"])
-    adjoint = -np.vstack([at.lin.A[0].T @ found.adjoint[0], found.adjoint])
+    broken = _violations(model, at, -own.terminal, plan.options["terminal_tolerance"])
+    adjoint = -np.vstack([at.lin.A[0].T @ broken.adjoint[0], broken.adjoint])
     history = [
         Multipliers(-h.terminal_multiplier, -1.0, -h.trust_multiplier, own.adjoint).normalized()
         for h in plan.history
     ]
+    lacking = np.array([h.virtual_control for h in plan.history])
     slope = None
     if time_weight is not None:
-        slope = time_slope(model, at, found.adjoint, weight) + time_weight
+        slope = time_slope(model, at, broken.adjoint, weight) + time_weight
+    rate = (at.lin.effort + at.lin.penalty) / (model.times[-1] - model.times[0])
     return Certificate(
         status=plan.status,
         multipliers=own.normalized(),
@@ -265,37 +260,20 @@ def certify(
         ),
         cost_history=np.array([h.cost for h in history]),
         trust_region_history=np.array([h.trust_region for h in history]),
-        relaxed=np.array(
-            [h.virtual_control > _RELAXED * found.scales.state for h in plan.history], dtype=bool
-        ),
-        violations=found,
+        relaxed=lacking > _RELAXED * broken.scales.state,
+        violations=broken,
         adjoint=adjoint,
         adjoint_difference=_largest(adjoint[1:] - own.adjoint[1:]),
         transversality=None if slope is None else -slope,
-        cost_rate=max(
-            (at.lin.effort + at.lin.penalty) / (model.times[-1] - model.times[0]),
-            abs(time_weight or 0.0),
-            1e-300,
-        ),
+        cost_rate=max(rate, abs(time_weight or 0.0), 1e-300),
         tolerance=float(tolerance),
     )
 
 
-def model_for(plan: Plan) -> Model:
-    """The completed problem of a plan, with the integrator it was made with.
-
-    Raises:
-        ValueError: if the plan does not know its problem.
-    """
-    if plan.problem is None:
-        raise ValueError(
-            "this plan does not know its problem (it was loaded from a file that could not keep "
-            "it), and this needs its dynamics: plan.replace(problem=...) first"
-        )
-    model = model_of(plan.problem)
-    integrator = plan.options.get("integrator", model.integrator)
-    return dataclasses.replace(model, integrator=integrator)
-
-
 def _largest(values: Array) -> float:
     return float(np.max(np.abs(values), initial=0.0))
+
+
+def _worst(residuals: dict[str, float]) -> float:
+    values = np.array(list(residuals.values()))
+    return float(values.max()) if np.isfinite(values).all() else np.inf

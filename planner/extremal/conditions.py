@@ -15,8 +15,9 @@ import numpy as np
 
 from slipcar.planner.extremal.coupling import coupled_step
 from slipcar.planner.extremal.maximum_principle import FirstOrder, Scales, first_order
-from slipcar.planner.extremal.newton_step import NewtonSystem, Pieces, Step
+from slipcar.planner.extremal.newton_step import NewtonSystem, Pieces
 from slipcar.planner.extremal.second_order import SecondOrder, second_order
+from slipcar.planner.lq.banded import PrimalDual
 from slipcar.planner.problem.control_set import project_controls
 from slipcar.planner.problem.model import Model
 
@@ -29,11 +30,11 @@ _COUPLING_PART = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class Point:
+class ShootingPoint:
     """A primal-dual point with its residuals.
 
     Attributes:
-        first: first derivatives there.
+        gradients: first derivatives there.
         adjoint: λ_1..λ_K, (K, n).
         terminal: ν, (q,).
         slope: gradient of the Lagrangian with respect to u, (K, m).
@@ -41,7 +42,7 @@ class Point:
         largest: largest of them.
     """
 
-    first: FirstOrder
+    gradients: FirstOrder
     adjoint: Array
     terminal: Array
     slope: Array
@@ -65,16 +66,16 @@ class Conditions:
     tolerance: float
     scales: Scales
 
-    def at(self, x: Array, u: Array, adjoint: Array, terminal: Array) -> Point:
+    def at(self, x: Array, u: Array, adjoint: Array, terminal: Array) -> ShootingPoint:
         """Residuals at a point."""
         model, scales = self.model, self.scales
-        first = first_order(model, x, u, self.variance_weight)
-        lin = first.lin
-        rest = first.state_gradient - adjoint
+        gradients = first_order(model, x, u, self.variance_weight)
+        lin = gradients.lin
+        rest = gradients.state_gradient - adjoint
         rest[:-1] += np.matmul(adjoint[1:, None], lin.A[1:])[:, 0]
         rest[-1] += terminal @ lin.G
-        slope = first.slope(adjoint)
-        wanted = self._wanted(first.sub.R, u, slope)
+        slope = gradients.slope(adjoint)
+        wanted = self._wanted(gradients.sub.R, u, slope)
         control = u - project_controls(wanted, model.lower, model.upper, model.radius)
         end = lin.g - np.clip(self._pressed(lin.g, terminal), -self.tolerance, self.tolerance)
         parts = np.concatenate(
@@ -87,7 +88,7 @@ class Conditions:
         )
         norm = float(np.linalg.norm(parts))
         largest = float(np.max(np.abs(parts))) if np.isfinite(norm) else np.inf
-        return Point(first, adjoint, terminal, slope, norm, largest)
+        return ShootingPoint(gradients, adjoint, terminal, slope, norm, largest)
 
     def _wanted(self, R: Array, u: Array, slope: Array) -> Array:
         """Where −D⁻¹ slope leads from u; its projection onto U is u at an extremal, (K, m)."""
@@ -100,9 +101,9 @@ class Conditions:
         """Where ν/s leads from g; its projection onto the terminal box is g at one, (q,)."""
         return g + terminal * (self.scales.state / self.scales.adjoint)
 
-    def moved(self, here: Point, step: Step, length: float) -> Point:
+    def moved(self, here: ShootingPoint, step: PrimalDual, length: float) -> ShootingPoint:
         """The point a part of the step away."""
-        lin = here.first.lin
+        lin = here.gradients.lin
         x = lin.x.copy()
         x[1:] += length * step.d
         return self.at(
@@ -112,45 +113,46 @@ class Conditions:
             here.terminal + length * step.terminal,
         )
 
-    def newton(self, here: Point) -> Step | None:
+    def newton(self, here: ShootingPoint) -> PrimalDual | None:
         """The Newton step; None if its matrix is singular."""
-        first = here.first
-        second = second_order(self.model, first, here.adjoint, here.terminal, self.variance_weight)
-        pieces = self._pieces(here, second, None)
-        settled: tuple[NewtonSystem, Step] | None = None
+        model, weight, gradients = self.model, self.variance_weight, here.gradients
+        hessians = second_order(model, gradients, here.adjoint, here.terminal, weight)
+        pieces = self._pieces(here, hessians, None)
+        settled: tuple[NewtonSystem, PrimalDual] | None = None
         for _ in range(_PIECE_SOLVES):
             system = NewtonSystem(
-                first, second, here.adjoint, here.terminal, pieces, self.tolerance
+                gradients, hessians, here.adjoint, here.terminal, pieces, self.tolerance
             )
             step = system.solve() if system.regular else None
-            if step is None or not step.finite:
+            if step is None:
                 break  # with so many controls held, the end is out of reach
             settled = system, step
-            found = self._pieces(here, second, step)
-            if found.same(pieces):
+            reached = self._pieces(here, hessians, step)
+            if reached.same(pieces):
                 break
-            pieces = found
+            pieces = reached
         if settled is None:
             return None
         system, step = settled
-        if first.weights is not None:
-            # As exact as the residual is small: quadratic convergence, and no more work.
-            small = min(here.largest, 1.0)
-            enough = _COUPLING_PART * small * small * self.scales.adjoint
-            weight = self.variance_weight
-            step = coupled_step(self.model, first, second, system, step, weight, enough)
-        return step if step.finite else None
+        if gradients.weights is None:
+            return step
+        # As exact as the residual is small: quadratic convergence, and no more work.
+        small = min(here.largest, 1.0)
+        enough = _COUPLING_PART * small * small * self.scales.adjoint
+        return coupled_step(model, gradients, hessians, system, step, weight, enough)
 
-    def _pieces(self, here: Point, second: SecondOrder, step: Step | None) -> Pieces:
+    def _pieces(
+        self, here: ShootingPoint, hessians: SecondOrder, step: PrimalDual | None
+    ) -> Pieces:
         """The pieces at a point, or those a step leads to by the linearised conditions."""
-        model, sub = self.model, here.first.sub
-        c, g, u, slope, terminal = sub.b, sub.g, here.first.lin.u, here.slope, here.terminal
+        model, sub = self.model, here.gradients.sub
+        c, g, u, slope, terminal = sub.b, sub.g, here.gradients.lin.u, here.slope, here.terminal
         if step is not None:
-            c = c + np.matmul(sub.a, step.d[..., None])[..., 0]
+            c = sub.hinge_arguments(step.d)
             g, u, terminal = g + sub.G @ step.d[-1], u + step.e, terminal + step.terminal
             slope = slope + np.matmul(step.adjoint[:, None], sub.B)[:, 0]
-            slope += np.matmul(second.uu, step.e[..., None])[..., 0]
-            slope[1:] += np.matmul(second.ux[1:], step.d[:-1, :, None])[..., 0]
+            slope += np.matmul(hessians.uu, step.e[..., None])[..., 0]
+            slope[1:] += np.matmul(hessians.ux[1:], step.d[:-1, :, None])[..., 0]
         wanted = self._wanted(sub.R, u, slope)
         ball = np.zeros(len(u), dtype=bool)
         if np.isfinite(model.radius):

@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from slipcar.planner.extremal.maximum_principle import FirstOrder
-from slipcar.planner.extremal.newton_step import NewtonSystem, Step
+from slipcar.planner.extremal.newton_step import NewtonSystem
 from slipcar.planner.extremal.second_order import SecondOrder
+from slipcar.planner.lq.banded import PrimalDual
 from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
@@ -22,36 +23,39 @@ _SOLVES = 12
 
 def coupled_step(
     model: Model,
-    first: FirstOrder,
-    second: SecondOrder,
+    gradients: FirstOrder,
+    hessians: SecondOrder,
     system: NewtonSystem,
-    step: Step,
+    step: PrimalDual,
     variance_weight: float,
     enough: float,
-) -> Step:
-    """The Newton step with what the change of Λ along it adds.
+) -> PrimalDual | None:
+    """The Newton step with what the change of Λ along it adds; None if it overflows.
 
     Args:
         model: the problem.
-        first: first derivatives, with Λ.
-        second: Hessian blocks.
+        gradients: first derivatives, with Λ.
+        hessians: Hessian blocks.
         system: factorised for the pieces of `step`.
         step: with Λ held.
         variance_weight: w > 0.
         enough: largest error of the adjoint equation to leave.
     """
-    d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], first.lin.x[:-1]))
+    d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], gradients.lin.x[:-1]))
     push = np.zeros_like(step.d)
     pushes: list[Array] = []
     errors: list[Array] = []
     for _ in range(_SOLVES):
-        error = variance_weight * gradient_change(model, first, second, d_sigma, step) - push
+        error = variance_weight * gradient_change(model, gradients, hessians, d_sigma, step) - push
         if not np.max(np.abs(error)) > enough:
             break
         pushes.append(push)
         errors.append(error)
         push = _next_guess(pushes, errors)
-        step = system.solve(push)
+        coupled = system.solve(push)
+        if coupled is None:
+            return None
+        step = coupled
     return step
 
 
@@ -71,32 +75,32 @@ def _next_guess(pushes: list[Array], errors: list[Array]) -> Array:
 
 
 def gradient_change(
-    model: Model, first: FirstOrder, second: SecondOrder, d_sigma: Array, step: Step
+    model: Model, gradients: FirstOrder, hessians: SecondOrder, d_sigma: Array, step: PrimalDual
 ) -> Array:
     """Change of the gradient of ∫ tr Σ at nodes 1..K because Λ moves with the step.
 
     Args:
         model: the problem.
-        first: first derivatives, with Λ.
-        second: for ∂A/∂x and ∂A/∂u.
+        gradients: first derivatives, with Λ.
+        hessians: for ∂A/∂x and ∂A/∂u.
         d_sigma: ∂σ/∂x at nodes 0..K−1, (K, n, d, n).
         step: the step.
 
     Returns:
         (K, n).
     """
-    Lambda, A = first.weights, first.lin.A
+    Lambda, A = gradients.weights, gradients.lin.A
     assert Lambda is not None
     d = step.d
     K, n = d.shape
-    dA = np.matmul(second.A_u, step.e[:, None, :, None])[..., 0]
-    dA[1:] += np.matmul(second.A_x[1:], d[:-1, None, :, None])[..., 0]
+    dA = np.matmul(hessians.A_u, step.e[:, None, :, None])[..., 0]
+    dA[1:] += np.matmul(hessians.A_x[1:], d[:-1, None, :, None])[..., 0]
     one_sided = dA[1:].swapaxes(1, 2) @ Lambda[1:] @ A[1:]
     driven = one_sided + one_sided.swapaxes(1, 2)
     change = np.zeros((K, n, n))
     for k in range(K - 2, -1, -1):
         change[k] = driven[k] + A[k + 1].T.dot(change[k + 1]).dot(A[k + 1])
-    against = 2.0 * model.dt[:, None, None] * (change @ first.lin.sigma)
-    found = np.zeros((K, n))
-    found[:-1] = np.einsum("kac,kaci->ki", against, d_sigma)[1:]
-    return found
+    against = 2.0 * model.dt[:, None, None] * (change @ gradients.lin.sigma)
+    total = np.zeros((K, n))
+    total[:-1] = np.einsum("kac,kaci->ki", against, d_sigma)[1:]
+    return total

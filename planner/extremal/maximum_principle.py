@@ -1,4 +1,4 @@
-"""The discrete maximum principle: what makes a trajectory an extremal (paper §2.2, SPEC §3.7).
+"""The discrete maximum principle: what makes a trajectory an extremal (paper §2.2).
 
 With ℓ_k the costs charged at node k (hinges, state costs, the variance penalty through σ(x_k)),
 F_k(x, u) the step from node k to k + 1 and p⁰ = −1, a trajectory x_0..x_K, u_0..u_{K−1} is an
@@ -22,7 +22,7 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.convex.convexify import Subproblem, convexify
+from slipcar.planner.convex.subproblem import Subproblem, convexify
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model
@@ -82,16 +82,7 @@ def first_order(
         if weights is None:
             weights = moments.adjoint_weights(lin.A, model.dt)
         variance = moments.variance_penalty(variance_weight, lin.sigma, d_sigma, weights, model.dt)
-    sub = convexify(
-        model,
-        lin,
-        variance=variance,
-        composite=True,
-        trust_multiplier=0.0,
-        trust_weight=None,
-        rho=1.0,
-    )
-    return FirstOrder(lin, weights, sub)
+    return FirstOrder(lin, weights, convexify(model, lin, variance=variance))
 
 
 def adjoint_of(at: FirstOrder, terminal: Array) -> Array:
@@ -142,23 +133,22 @@ def minimize_over_controls(model: Model, R: Array, r: Array, u: Array) -> Array:
     R, r, u, lower, upper = R[out], r[out], u[out], lower[out], upper[out]
     eye = np.eye(u.shape[1])
 
-    def held(kappa: Array) -> Array:
-        return _minimize_over_box(
-            R + kappa[:, None, None] * eye, r + kappa[:, None] * u, lower, upper
-        )
+    def pulled(kappa: Array) -> Array:
+        bent = R + kappa[:, None, None] * eye
+        return _minimize_over_box(bent, r + kappa[:, None] * u, lower, upper)
 
     # Where the box alone would go, ‖R e + r‖ pulls: a few times that keeps anything inside.
     low, high = np.zeros(len(u)), np.einsum("kii->k", R)
     for _ in range(200):
-        long = np.linalg.norm(u + held(high), axis=1) > model.radius
+        long = np.linalg.norm(u + pulled(high), axis=1) > model.radius
         if not long.any():
             break
         high = np.where(long, 4.0 * high, high)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        long = np.linalg.norm(u + held(middle), axis=1) > model.radius
+        long = np.linalg.norm(u + pulled(middle), axis=1) > model.radius
         low, high = np.where(long, middle, low), np.where(long, high, middle)
-    e[out] = held(high)
+    e[out] = pulled(high)
     return e
 
 
@@ -219,9 +209,9 @@ def hamiltonian(model: Model, t: Array, x: Array, p: Array, u: Array) -> Array:
         p: adjoints at the end of the interval, p⁰ = −1, (..., n).
         u: controls, (..., m).
     """
-    many = np.broadcast_shapes(np.shape(t), x.shape[:-1], u.shape[:-1])
-    t, u = np.broadcast_to(t, many), np.broadcast_to(u, (*many, u.shape[-1]))
-    b = model.drift(t, np.broadcast_to(x, (*many, x.shape[-1])), u)
+    batch = np.broadcast_shapes(np.shape(t), x.shape[:-1], u.shape[:-1])
+    t, u = np.broadcast_to(t, batch), np.broadcast_to(u, (*batch, u.shape[-1]))
+    b = model.drift(t, np.broadcast_to(x, (*batch, x.shape[-1])), u)
     return np.einsum("...i,...i->...", p, b) - np.einsum("...i,ij,...j->...", u, model.R, u)
 
 
@@ -269,8 +259,8 @@ def held_variance_gradient(at: FirstOrder, A_x: Array, S: Array, variance_weight
     Returns:
         At nodes 1..K (zero at the last, which drives nothing), (K, n).
     """
-    found = np.zeros_like(at.lin.defect)
+    gradient = np.zeros_like(at.lin.defect)
     if at.weights is not None:
         force = 2.0 * variance_weight * at.weights @ at.lin.A @ S[:-1]
-        found[:-1] = np.einsum("kab,kabi->ki", force, A_x)[1:]
-    return found
+        gradient[:-1] = np.einsum("kab,kabi->ki", force, A_x)[1:]
+    return gradient

@@ -66,23 +66,18 @@ def second_order(
     for j in range(n, n + moved):
         U[2 * j, :K, j - n] += steps[j]
         U[2 * j + 1, :K, j - n] -= steps[j]
-    held = None
     if weights is not None:
-        held = np.zeros((copies, N, n, n))
-        held[:, :K] = weights
+        repeated = np.zeros((copies, N, n, n))
+        repeated[:, :K] = weights
+        weights = repeated.reshape(-1, n, n)[:-1]
     filler = model.dt[-1:]
     chain = dataclasses.replace(
         model,
         times=np.tile(model.times, copies),
         dt=np.tile(np.concatenate([model.dt, filler]), copies)[:-1],
     )
-    at = first_order(
-        chain,
-        X.reshape(-1, n),
-        U.reshape(-1, m)[:-1],
-        variance_weight,
-        None if held is None else held.reshape(-1, n, n)[:-1],
-    )
+    u = U.reshape(-1, m)[:-1]
+    at = first_order(chain, X.reshape(-1, n), u, variance_weight, weights)
 
     def parts(values: Array) -> Array:
         """(copies · N − 1, ...) -> (copies, K, ...)."""
@@ -97,10 +92,10 @@ def second_order(
     by_state[:, -1] += np.einsum("q,cqi->ci", terminal, G)
     by_control = parts(at.sub.r) + np.einsum("kj,ckji->cki", adjoint, B)
 
-    def derivative(values: Array, first: int, count: int) -> Array:
+    def derivative(values: Array, begin: int, count: int) -> Array:
         """Differences over the copies that shift these components, as a last axis."""
-        chosen = values[2 * first : 2 * (first + count)]
-        scale = 0.5 / steps[first : first + count]
+        chosen = values[2 * begin : 2 * (begin + count)]
+        scale = 0.5 / steps[begin : begin + count]
         return np.moveaxis(chosen[::2] - chosen[1::2], 0, -1) * scale
 
     xx = derivative(by_state, 0, n)

@@ -20,23 +20,22 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from slipcar.planner.extremal.certificate import model_for
-from slipcar.planner.extremal.conditions import Conditions
+from slipcar.planner.extremal.conditions import Conditions, ShootingPoint
 from slipcar.planner.extremal.maximum_principle import adjoint_of, first_order, scales
+from slipcar.planner.extremal.planned import Planned, model_for
+from slipcar.planner.lq.banded import PrimalDual
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
 from slipcar.planner.status import Status
 
-if TYPE_CHECKING:
-    from slipcar.planner.plan import Plan
-
 Array = np.ndarray
+P = TypeVar("P", bound=Planned)
 
 #: Where to start. Of 150 random worlds with turned headings (w = 1), 148 lead to a shot that
 #: converges when it is tried at a residual of 0.2 and again whenever that has halved, 1.1 times
@@ -144,53 +143,56 @@ def shoot(
     start = first_order(model, x, u, variance_weight)
     if adjoint is None:
         adjoint = adjoint_of(start, terminal)
-    conditions = Conditions(
-        model, variance_weight, terminal_tolerance, scales(model, start, adjoint)
-    )
+    sizes = scales(model, start, adjoint)
+    conditions = Conditions(model, variance_weight, terminal_tolerance, sizes)
     here = conditions.at(x, u, adjoint, terminal)
-    history: list[ShotIteration] = []
-
-    def record(step: float) -> None:
-        seconds = time.perf_counter() - began
-        lin = here.first.lin
-        history.append(ShotIteration(lin.x, lin.u, here.terminal, here.largest, step, seconds))
-
-    def ended(message: str) -> Shot:
-        return Shot(
-            converged=message == "converged",
-            at=here.first.lin,
-            adjoint=here.adjoint,
-            terminal=here.terminal,
-            history=tuple(history),
-            seconds=time.perf_counter() - began,
-            attempted=history[0].residual <= start_within,
-            message=message,
-        )
-
-    record(0.0)
-    if not here.largest <= start_within:
-        return ended("too far from an extremal to start")
-    for _ in range(max_iterations):
+    history = [_row(here, 0.0, began)]
+    attempted = here.largest <= start_within
+    message = "" if attempted else "too far from an extremal to start"
+    while not message:
         if here.largest <= tolerance:
-            break
-        step = conditions.newton(here)
-        if step is None:
-            return ended("the Newton matrix is singular")
-        length = 1.0
+            message = "converged"
+        elif len(history) > max_iterations:
+            message = "not within max_iterations"
+        elif (step := conditions.newton(here)) is None:
+            message = "the Newton matrix is singular"
+        elif (there := _descend(conditions, here, step)) is None:
+            message = "no step along Newton's direction reduces the residual"
+        else:
+            here, length = there
+            history.append(_row(here, length, began))
+    u = here.gradients.lin.u
+    inside = model.admissible(u)  # they pass their bounds by rounding errors
+    if message == "converged" and (inside != u).any():
+        here = conditions.at(here.gradients.lin.x, inside, here.adjoint, here.terminal)
+    return Shot(
+        converged=message == "converged",
+        at=here.gradients.lin,
+        adjoint=here.adjoint,
+        terminal=here.terminal,
+        history=tuple(history),
+        seconds=time.perf_counter() - began,
+        attempted=attempted,
+        message=message,
+    )
+
+
+def _descend(
+    conditions: Conditions, here: ShootingPoint, step: PrimalDual
+) -> tuple[ShootingPoint, float] | None:
+    """The first point along the step that reduces the residual enough, and how far it is."""
+    length = 1.0
+    while length >= _SHORTEST:
         there = conditions.moved(here, step, length)
-        while not there.norm <= (1.0 - _DECREASE * length) * here.norm:
-            length *= 0.5
-            if length < _SHORTEST:
-                return ended("no step along Newton's direction reduces the residual")
-            there = conditions.moved(here, step, length)
-        here = there
-        record(length)
-    if not here.largest <= tolerance:
-        return ended("not within max_iterations")
-    inside = model.admissible(here.first.lin.u)  # they pass their bounds by rounding errors
-    if (inside != here.first.lin.u).any():
-        here = conditions.at(here.first.lin.x, inside, here.adjoint, here.terminal)
-    return ended("converged")
+        if there.norm <= (1.0 - _DECREASE * length) * here.norm:
+            return there, length
+        length *= 0.5
+    return None
+
+
+def _row(here: ShootingPoint, step: float, began: float) -> ShotIteration:
+    lin, seconds = here.gradients.lin, time.perf_counter() - began
+    return ShotIteration(lin.x, lin.u, here.terminal, here.largest, step, seconds)
 
 
 def retry_within(shot: Shot, limit: float) -> float:
@@ -203,7 +205,7 @@ def retry_within(shot: Shot, limit: float) -> float:
     return min(limit, _RETRY * shot.history[0].residual) if shot.attempted else limit
 
 
-def shoot_from(plan: Plan, iteration: int | None = None, **options: Any) -> Shot:
+def shoot_from(plan: Planned, iteration: int | None = None, **options: Any) -> Shot:
     """Shoot from an iteration of a plan's history.
 
     Args:
@@ -225,7 +227,7 @@ def shoot_from(plan: Plan, iteration: int | None = None, **options: Any) -> Shot
     return shoot(model, x, u, terminal, **options)
 
 
-def improved(plan: Plan, shot: Shot) -> Plan:
+def improved(plan: P, shot: Shot) -> P:
     """The plan with a converged shot's trajectory and multipliers in place of its own.
 
     Raises:

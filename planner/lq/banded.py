@@ -1,14 +1,13 @@
-"""The LQ problem at the heart of every structured step, as one banded linear system.
+"""The LQ problem as one banded linear system, whatever the signs of its Hessians.
 
-    minimise  Σ ½ eᵀRe + rᵀe + ½ dᵀQd + qᵀd    s.t.   d⁺ = A d + B e + f,   d_0 = 0,
-              G d_K − δ ν = s
+With the controls eliminated, e = e⁰ − M (S d + Bᵀλ⁺) with M = H⁻¹ and e⁰ = −M h (or M the inverse
+on the directions that are free, and e⁰ the step in the others), the optimality conditions are
 
-With the controls eliminated, e = −R⁻¹(r + Bᵀλ), its optimality conditions are
+    −λ_k + (Q − SᵀMS)_k d_k + (A − BMS)_kᵀ λ_{k+1} = −(q + Sᵀe⁰)_k
+    d_{k+1} = (A − BMS)_k d_k − (B M Bᵀ)_k λ_{k+1} + (f + B e⁰)_k
+    G d_K − δ ν = s
 
-    −λ_k + Q_k d_k + A_kᵀ λ_{k+1} = −q_k
-    d_{k+1} = A_k d_k − B_k R_k⁻¹ (r_k + B_kᵀ λ_{k+1}) + f_k,
-
-banded with 2n − 1 off-diagonals in the order λ_1, d_1, λ_2, d_2, ..., d_K, ν.
+in the order λ_1, d_1, λ_2, d_2, ..., d_K, ν: banded with 2n − 1 off-diagonals.
 """
 
 from __future__ import annotations
@@ -16,15 +15,14 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-
-from slipcar.planner.convex.convexify import Subproblem
+from numpy.lib.stride_tricks import as_strided
 
 Array = np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Point:
-    """A primal-dual point of the sub-problem.
+@dataclasses.dataclass(frozen=True, slots=True)
+class PrimalDual:
+    """A primal-dual point, or a step.
 
     Attributes:
         d: deviations of nodes 1..K, (K, n).
@@ -38,9 +36,9 @@ class Point:
     adjoint: Array
     terminal: Array
 
-    def towards(self, other: Point, step: float) -> Point:
+    def towards(self, other: PrimalDual, step: float) -> PrimalDual:
         """The point a fraction `step` of the way to another."""
-        return Point(
+        return PrimalDual(
             self.d + step * (other.d - self.d),
             self.e + step * (other.e - self.e),
             self.adjoint + step * (other.adjoint - self.adjoint),
@@ -48,119 +46,111 @@ class Point:
         )
 
 
-class BandedKkt:
-    """The matrix in LAPACK band storage, with index arrays computed once per shape."""
+class BandedLq:
+    """LQ problems of one shape: `load` what many share, `factor` one of them, `solve` it.
+
+    Args:
+        K: intervals.
+        n: states.
+        q: terminal conditions.
+    """
 
     def __init__(self, K: int, n: int, q: int) -> None:
+        from scipy.linalg import lapack  # here: other plans do without SciPy's import time
+
+        self._lapack = lapack
         self.shape = (K, n, q)
-        self.size = 2 * n * K + q
-        self.width = max(2 * n - 1, n + q - 1)
-        self.rows = 3 * self.width + 1
-        node = 2 * n * np.arange(K)[:, None, None]
-        i, j = np.arange(n)[:, None], np.arange(n)[None, :]
-        # Rows of block k: n dynamics (for λ_{k+1}), then n adjoint equations (for d_{k+1}).
-        self._at_S = self._flat(node + i, node + j)
-        self._at_Q = self._flat(node + n + i, node + n + j)
-        self._at_A = self._flat(node[1:] + i, node[1:] - n + j)
-        self._at_AT = self._flat(node[1:] - n + i, node[1:] + j)
-        k = np.arange(n)
-        at_minus_I = np.concatenate(
-            [
-                self._flat(node[..., 0] + k, node[..., 0] + n + k).ravel(),
-                self._flat(node[..., 0] + n + k, node[..., 0] + k).ravel(),
-            ]
-        )
+        self._width = max(2 * n - 1, n + q - 1)
+        # Transposed: LAPACK reads the band storage column by column.
+        self._base = np.zeros((2 * n * K + q, 3 * self._width + 1))
+        self._band = np.empty_like(self._base)
         last, end = 2 * n * K - n, 2 * n * K
-        r = np.arange(q)
-        self._at_G = self._flat(end + r[:, None], last + k[None, :])
-        self._at_GT = self._flat(last + k[None, :], end + r[:, None])
-        self._at_nu = self._flat(end + r, end + r)
-        # Transposed: LAPACK reads it column by column. Every load overwrites the same entries.
-        self._base = np.zeros((self.size, self.rows))
-        self._base.reshape(-1)[at_minus_I] = -1.0
-        self._sub: Subproblem | None = None
+        # Rows of block k: n dynamics (for λ_{k+1}), then n adjoint equations (for d_{k+1}).
+        self._at_A = self._block(self._base, 2 * n, n, (K - 1, n, n))
+        self._at_AT = self._block(self._base, n, 2 * n, (K - 1, n, n))
+        self._at_BMB = self._block(self._base, 0, 0, (K, n, n))
+        self._at_GT = self._block(self._base, last, end, (1, n, q))[0]
+        self._at_G = self._block(self._base, end, last, (1, q, n))[0]
+        self._at_delta = self._block(self._base, end, end, (1, q, q))[0]
+        self._at_Q = self._block(self._band, n, n, (K, n, n))
+        self._at_other_BMB = self._block(self._band, 0, 0, (K, n, n))
+        for row, column in ((0, n), (n, 0)):
+            identity = self._block(self._base, row, column, (K, n, n))
+            np.einsum("kii->ki", identity)[...] = -1.0
 
-    def _flat(self, row: Array, column: Array) -> Array:
-        return column * self.rows + (2 * self.width + row - column)
+    def _block(self, band: Array, row: int, column: int, shape: tuple[int, int, int]) -> Array:
+        """View of the blocks that begin at (row, column) and every 2n further on the diagonal."""
+        rows, item = band.shape[1], band.itemsize
+        begin = band.reshape(-1)[column * (rows - 1) + row + 2 * self._width :]
+        return as_strided(begin, shape, (2 * self.shape[1] * rows * item, item, (rows - 1) * item))
 
-    def load(self, sub: Subproblem) -> None:
-        """Take a sub-problem: fill in what its pieces do not change (once)."""
-        if sub is self._sub:
-            return
-        self._sub = sub
-        flat = self._base.reshape(-1)
-        self._R_inverse = np.linalg.inv(sub.R)
-        self._gain = sub.B @ self._R_inverse
-        flat[self._at_S] = -(self._gain @ sub.B.swapaxes(1, 2))
-        self._rows = sub.a.swapaxes(1, 2)
-        flat[self._at_A] = sub.A[1:]
-        flat[self._at_AT] = sub.A[1:].swapaxes(1, 2)
-        flat[self._at_GT] = sub.G
+    def load(self, A: Array, B: Array, M: Array, S: Array | None = None) -> None:
+        """Take dynamics A (K, n, n) and B (K, n, m), M (K, m, m) and S (K, m, n)."""
+        self._B, self._loaded, self._S = B, B @ M, S
+        if S is not None:
+            A, self._MS = A - self._loaded @ S, M @ S
+        self._at_A[...] = A[1:]
+        self._at_AT[...] = A[1:].swapaxes(1, 2)
+        np.negative(self._loaded @ B.swapaxes(1, 2), out=self._at_BMB)
 
-    def solve(
-        self,
-        weight: Array,
-        force: Array,
-        held: Array,
-        nu_diagonal: Array,
-        nu_right: Array,
-        control: tuple[Array, Array] | None = None,
-        ray: tuple[Array, Array, Array] | None = None,
-    ) -> Point | None:
-        """The LQ problem's solution, or None if the matrix is singular or overflows.
+    def end(self, G: Array, held: Array, delta: Array) -> None:
+        """Take the terminal condition.
 
         Args:
-            weight: w of the hinge rows, (K, p): adds ½ w (aᵀd)².
-            force: l of the hinge rows, (K, p): adds l aᵀd.
-            held: which terminal rows read (G d)_j − δ_j ν_j = s_j, (q,) bool; the others read
-                δ_j ν_j = s_j.
-            nu_diagonal: −δ for held rows, δ for others, (q,).
-            nu_right: s, (q,).
-            control: blocks added to R, (K, m, m), and vectors added to r, (K, m).
-            ray: t (K, m), a (K,) and s (K,): adds ½ a (tᵀe − s)², however stiff.
+            G: (q, n).
+            held: which rows read (G d)_j − δ_j ν_j = s_j, (q,) bool; the others read δ_j ν_j = s_j.
+            delta: δ ≥ 0, (q,).
+        """
+        self._at_GT[...] = G.T
+        np.multiply(G, held[:, None], out=self._at_G)
+        np.einsum("ii->i", self._at_delta)[...] = np.where(held, -delta, delta)
+
+    def factor(self, Q: Array, M: Array | None = None) -> bool:
+        """Factorise the system with Q of nodes 1..K, (K, n, n); False if it is singular.
+
+        Args:
+            Q: of nodes 1..K, (K, n, n).
+            M: in place of the loaded one (where there is no S), (K, m, m).
+        """
+        np.copyto(self._band, self._base)
+        self._BM = self._loaded
+        if M is not None:
+            self._BM = self._B @ M
+            np.negative(self._BM @ self._B.swapaxes(1, 2), out=self._at_other_BMB)
+        self._at_Q[...] = Q
+        if self._S is not None:
+            self._at_Q[:-1] -= (self._S.swapaxes(1, 2) @ self._MS)[1:]
+        w = self._width
+        self._factors, self._pivots, info = self._lapack.dgbtrf(
+            self._band.T, w, w, overwrite_ab=True
+        )
+        return info == 0
+
+    def solve(self, e0: Array, drift: Array, q: Array, s: Array) -> PrimalDual | None:
+        """The solution, or None if it overflows.
+
+        Args:
+            e0: e⁰, (K, m).
+            drift: f + B e⁰, (K, n).
+            q: (K, n).
+            s: (q,).
         """
         K, n, _ = self.shape
-        sub = self._sub
-        assert sub is not None, "load a sub-problem first"
-        band = self._base.copy()
-        flat = band.reshape(-1)
-        r, R_inverse, gain = sub.r, self._R_inverse, self._gain
-        if control is not None:
-            R_inverse = np.linalg.inv(sub.R + control[0])
-            r = r + control[1]
-        offset: Array = np.zeros(1)
-        if ray is not None:
-            # By Sherman and Morrison's formula, and the pull towards s apart: summed up first,
-            # a stiff ray would drown the rest in rounding errors.
-            t, a, s = ray
-            y = np.matmul(R_inverse, t[..., None])[..., 0]
-            share = a / (1.0 + a * np.sum(t * y, axis=1))
-            R_inverse = R_inverse - share[:, None, None] * y[:, :, None] * y[:, None, :]
-            offset = (share * s)[:, None] * y
-        if control is not None or ray is not None:
-            gain = sub.B @ R_inverse
-            flat[self._at_S] = -(gain @ sub.B.swapaxes(1, 2))
-        flat[self._at_Q] = sub.Q + self._rows @ (weight[..., None] * sub.a)
-        linear = sub.q + (self._rows @ force[..., None])[..., 0]
-        flat[self._at_G] = np.where(held[:, None], sub.G, 0.0)
-        flat[self._at_nu] = nu_diagonal
-        right = np.empty((self.size, 1))
-        blocks = right[: 2 * n * K, 0].reshape(K, 2, n)
-        np.subtract((gain @ r[..., None])[..., 0], sub.f, out=blocks[:, 0])
-        if ray is not None:
-            blocks[:, 0] -= (sub.B @ offset[..., None])[..., 0]
-        np.negative(linear, out=blocks[:, 1])
-        right[2 * n * K :, 0] = nu_right
-        from scipy.linalg import lapack  # here: compiled plans do without SciPy's import time
-
-        w = self.width
-        _, _, solution, info = lapack.dgbsv(
-            w, w, band.T, right, overwrite_ab=True, overwrite_b=True
+        w, right = self._width, np.empty(len(self._base))
+        blocks = right[: 2 * n * K].reshape(K, 2, n)
+        blocks[:, 0], blocks[:, 1] = drift, q
+        if self._S is not None:
+            blocks[:-1, 1] += np.matmul(e0[1:, None], self._S[1:])[:, 0]
+        np.negative(right, out=right)
+        right[2 * n * K :] = s
+        solution, _ = self._lapack.dgbtrs(
+            self._factors, w, w, right, self._pivots, overwrite_b=True
         )
-        if info != 0 or not np.isfinite(solution).all():
+        if not np.dot(solution, solution) < np.inf:
             return None
-        blocks = solution[: 2 * n * K, 0].reshape(K, 2, n)
+        blocks = solution[: 2 * n * K].reshape(K, 2, n)
         adjoint, d = blocks[:, 0], blocks[:, 1]
-        force = r + (adjoint[:, None] @ sub.B)[:, 0]
-        e = offset - (R_inverse @ force[..., None])[..., 0]
-        return Point(d, e, adjoint, solution[2 * n * K :, 0])
+        e = e0 - np.matmul(adjoint[:, None], self._BM)[:, 0]
+        if self._S is not None:
+            e[1:] -= np.matmul(self._MS[1:], d[:-1, :, None])[..., 0]
+        return PrimalDual(d, e, adjoint, solution[2 * n * K :])

@@ -23,13 +23,12 @@ model oscillates.)
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from slipcar.planner.problem.linearization import Linearization
-    from slipcar.planner.problem.model import Model
+from slipcar.planner.moments.propagation import congruence, covariance_step
+from slipcar.planner.problem.linearization import Linearization
+from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
 
@@ -77,15 +76,13 @@ def covariance(
         (K + 1, n, n); the first is Σ_0.
     """
     K, n = A.shape[:2]
-    noise = sigma @ sigma.swapaxes(1, 2)
-    by_column = None if d_sigma is None else d_sigma.swapaxes(1, 2)  # (K, d, n, n)
     S = np.zeros((K + 1, n, n))
     if start is not None:
         S[0] = start
+    moves = d_sigma is not None and d_sigma.any()
     for k in range(K):
-        if by_column is not None:
-            noise[k] += (by_column[k] @ S[k] @ by_column[k].swapaxes(1, 2)).sum(axis=0)
-        S[k + 1] = A[k].dot(S[k]).dot(A[k].T) + dt[k] * noise[k]
+        slope = d_sigma[k] if moves else None  # type: ignore[index]
+        S[k + 1] = covariance_step(A[k], S[k], sigma[k], slope, dt[k])
     return S
 
 
@@ -105,11 +102,10 @@ def trace_integral(S: Array, dt: Array) -> float:
 def adjoint_weights(A: Array, dt: Array) -> Array:
     """Λ_1..Λ_K, (K, n, n): what noise injected on arrival at node k+1 adds to ∫ tr Σ."""
     K, n = A.shape[:2]
-    eye = np.eye(n)
-    L = np.empty((K, n, n))
+    eye, L = np.eye(n), np.empty((K, n, n))
     L[K - 1] = dt[K - 1] * eye
     for k in range(K - 2, -1, -1):
-        L[k] = dt[k] * eye + A[k + 1].T.dot(L[k + 1]).dot(A[k + 1])
+        L[k] = dt[k] * eye + congruence(A[k + 1], L[k + 1])
     return L
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from slipcar.planner.moments.covariance import covariance
-
-if TYPE_CHECKING:
-    from slipcar.planner.problem.model import Model
+from slipcar.planner.moments.propagation import gain, weight_step
+from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
 
@@ -39,10 +38,8 @@ def lqr_gains(A: Array, B: Array, dt: Array, Q: Array, R: Array, Qf: Array) -> A
     K = np.empty((len(A), B.shape[2], A.shape[1]))
     P = Qf
     for k in range(len(A) - 1, -1, -1):
-        Rk = dt[k] * R
-        K[k] = -np.linalg.solve(Rk + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
-        closed = A[k] + B[k] @ K[k]
-        P = closed.T @ P @ closed + K[k].T @ Rk @ K[k] + (dt[k] * Q if k else 0.0)
+        K[k] = gain(A[k], B[k], P, dt[k] * R)
+        P = weight_step(A[k], B[k], P, K[k], dt[k] * R, None, dt[k]) + (dt[k] * Q if k else 0.0)
     return K
 
 
@@ -66,6 +63,11 @@ def closed_loop_covariance(
     at = times[:-1], mean[:-1]
     sigma, d_sigma = np.asarray(model.diffusion(*at)), np.asarray(model.diffusion_jacobian(*at))
     return covariance(A + B @ gains, sigma, np.diff(times), start=start, d_sigma=d_sigma)
+
+
+def feedback_effort(R: Array, dt: Array, gains: Array, S: Array) -> float:
+    """Σ dt tr(K Σ Kᵀ R), the effort of the corrections; gains (K, m, n), Σ (N, n, n)."""
+    return float(np.einsum("k,kmi,kij,klj,lm", dt, gains, S[:-1], gains, R, optimize=True))
 
 
 def wrap(error: Array, angles: Iterable[int]) -> Array:

@@ -15,7 +15,8 @@ from collections.abc import Callable
 import numpy as np
 
 from slipcar.planner.options import check_count
-from slipcar.planner.problem.model import Model, Problem, model_of
+from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.problem.protocol import Problem
 
 Array = np.ndarray
 

@@ -1,298 +1,478 @@
-"""SCP with one LQ problem per iteration and the curvature of the Lagrangian.
+"""Newton's iteration: one linear-quadratic problem each, for plans of the mean and of the belief.
 
 Each iteration solves one quadratic model, cut down to what is smooth at the iterate:
 
-* the hinges max(0, c)² that are on at the iterate are squares, the others are off. That is the
-  gradient at the iterate, so a step is a direction of descent; which hinges are on settles over
-  the iterations rather than within each (as exact sub-problems do it);
+* the hinges max(0, c)² that are on at the iterate are squares, the others are off; rows that are
+  Gaussian are smooth (:mod:`slipcar.planner.moments.losses`). Which hinges are on settles over the
+  iterations rather than within each (as exact sub-problems do it);
 * bounds of the controls are kept exactly: the LQ problem is solved again while the set of active
   ones changes;
-* without a better guess, hinges are left out at first, until steps are short: which way round the
+* without a better guess, rows are left out at first, until steps are short: which way round the
   obstacles is then decided by where the free path runs, not by where the guess did;
 * at first the model is that of the paper's convex sub-problem. Whole steps are taken: bold ones
   are what finds a way. When they are no longer than the controls, or after some number of them,
-  the curvature of dynamics, hinges and terminal condition is added, weighed by the
-  multipliers: Newton's method on the optimality conditions, quadratic at the end (with a variance
-  penalty, whose adjoint weights are held, linear with a factor of some hundredths);
+  the curvature of dynamics, rows and terminal condition is added, weighed by the multipliers:
+  Newton's method on the optimality conditions, quadratic at the end (with noise charged, whose
+  weights P are held in a step, linear with a factor of some hundredths to tenths);
 * where the model is then not convex in the controls (a pivot of the Riccati recursion is not
   positive), a multiple of the identity is added: a trust region by its multiplier, −p¹ of the
   paper. A line search on a merit function makes it descend;
 * after a few rejected steps in a row the convex model's step, searched further, goes first;
-* steps that no longer become shorter go round in circles (between sets of hinges, as a rule): then
-  the multiple of the identity is kept from vanishing.
+* steps that no longer become shorter go round in circles: then the multiple of the identity is kept
+  from vanishing.
+
+Plans that count the noise start from a plan of the mean, with curvature from the first step on.
+After each step the belief follows: covariance, rows' spread, weights P and gains K
+(:mod:`slipcar.planner.moments.propagation`). Its fixed points are stationary points of the expected
+cost in controls and gains, but for how ∂b/∂x, σ′, C and ½ tr(∂²c Σ) follow.
 
 The merit function is Φ = cost + Σ λᵀf + νᵀg + s (½ max|λ| ‖f‖₁ + ½ max|ν| ‖g‖₁), f the defects of
-the dynamics and g the terminal condition, with s ≥ 1 large enough that the step descends. In its
-variance term the adjoint weights Λ of the iterate are held, as in the model (:mod:`..moments`).
-
-Its fixed points are those of the paper's scheme, extremals; `python benchmarks/run.py --only
-worlds` counts from how many random worlds it gets there.
+the dynamics and g the terminal condition, with s ≥ 1 large enough that the step descends.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import math
 import time
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from slipcar.planner.history import Iteration
-from slipcar.planner.newton.functions import Functions
-from slipcar.planner.newton.lq import LqSolution, LqSolver, gramian_trace
-from slipcar.planner.newton.model import (
-    Iterate,
-    Quadratic,
-    evaluate,
-    quadratic_model,
-    solve_model,
-    times,
-)
-from slipcar.planner.newton.settings import TUNING
-from slipcar.planner.options import Options
-from slipcar.planner.outcome import Outcome
-from slipcar.planner.problem.feasibility import inconsistency, not_finite
-from slipcar.planner.problem.linearization import Linearization
-from slipcar.planner.problem.model import Model
+from slipcar.planner.newton.equations import Evaluation, Model, Promise
+from slipcar.planner.newton.program import Workspace
+from slipcar.planner.newton.tuning import Tuning
+from slipcar.planner.problem.linearization import nearest_semidefinite
 from slipcar.planner.status import Status
 
 Array = np.ndarray
 
 
-def iterate(
-    model: Model,
-    functions: Functions,
-    options: Options,
-    x: Array,
-    u: Array,
-    *,
-    free_first: bool,
-) -> Outcome:
-    """Run the iteration from the guess x (N, n), u (N−1, m); `free_first` leaves hinges out first.
+class Task(NamedTuple):
+    """What an iteration is asked for; the arrays of its workspace hold the rest.
 
-    Raises:
-        ValueError: if the model functions are not finite along the guess.
+    Attributes:
+        tolerance: stop when two steps together, ∫ ‖Δu‖² dt, fall to it.
+        max_iterations: at most so many steps.
+        unit: of a shift, the largest diagonal entry of R.
+        longest_dt: the longest interval.
+        released: leave the rows out at first.
+        variance_weight: w.
+        feedback: plan gains.
+        saturation: bounds are kept at so many standard deviations of the correction.
+        warm: gains, rows' weights and multipliers in the workspace are those of a plan nearby.
     """
-    w = options.variance_weight
-    clock = time.perf_counter()
-    at = evaluate(model, functions, w, x, u)
-    if not at.finite:
-        raise ValueError(f"{not_finite(at.lin)} is not finite along the guess")
-    K, n = at.lin.defect.shape
-    q = len(at.lin.g)
-    adjoint, terminal = np.zeros((K, n)), np.zeros(q)
-    shift, last, rejected, settling = 0.0, np.inf, 0, np.inf
-    solver = LqSolver(K, n, u.shape[1], q)
-    R = 2.0 * model.dt[:, None, None] * model.R
-    gramian = gramian_trace(at.lin.A, at.lin.B, R, at.lin.G)
-    unit = float(np.max(np.diag(model.R)))  # of a shift
-    bounds = (np.zeros(u.shape, dtype=bool), np.zeros(u.shape, dtype=bool))
-    history: list[Iteration] = []
-    status = Status.MAX_ITERATIONS
-    circling = _Circling(unit)
-    released = free_first and len(model.weight) > 0
-    for iteration in range(options.max_iterations):
-        if released and (
-            settling < TUNING.released * at.lin.effort or iteration >= TUNING.released_steps
-        ):
-            released, last = False, np.inf
-        newton = (
-            not released
-            and bool(history)
-            and (iteration >= TUNING.free_steps or settling < TUNING.settled * at.lin.effort)
+
+    tolerance: float
+    max_iterations: int
+    unit: float
+    longest_dt: float
+    released: bool = False
+    variance_weight: float = 0.0
+    feedback: bool = False
+    saturation: float = 1.0
+    warm: bool = False
+
+
+class StepTaken(NamedTuple):
+    """One step tried: the numbers of an `Iteration`."""
+
+    effort: float
+    penalty: float
+    running: float
+    variance: float
+    merit: float
+    predicted: float
+    actual: float
+    step: float
+    trust_radius: float
+    trust_multiplier: float
+    defect: float
+    terminal_residual: float
+    accepted: bool
+    solver_iterations: int
+    linearize_seconds: float
+    solve_seconds: float
+
+
+class Ending(NamedTuple):
+    """How an iteration ended.
+
+    Attributes:
+        status: None where a function is not finite along the guess.
+        side: of the workspace, where the last iterate is.
+        tried: steps.
+        at: the last iterate's costs.
+    """
+
+    status: Status | None
+    side: int
+    tried: int
+    at: Evaluation
+
+
+class Filler(Protocol):
+    """Fills the quantities of a problem that is not traced."""
+
+    def point(self, workspace: Workspace, side: int) -> None:
+        """Values and first derivatives at a point."""
+        ...
+
+    def second(self, workspace: Workspace, side: int) -> None:
+        """Second derivatives there."""
+        ...
+
+
+#: Told of every step: the numbers, and the side where its trajectory is; True stops.
+Watcher = Callable[[StepTaken, int], bool | None]
+
+
+class Iteration:
+    """The state of one run, and what is done with it.
+
+    Args:
+        workspace: with the problem and the guess loaded, on side 0.
+        task: what is asked for.
+        tuning: numbers of the method.
+        filler: for problems that are not traced.
+        watch: told of every step.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        task: Task,
+        tuning: Tuning,
+        filler: Filler | None = None,
+        watch: Watcher | None = None,
+    ) -> None:
+        self.workspace, self.task, self.tuning = workspace, task, tuning
+        self.filler, self.watch = filler, watch
+        form = workspace.program.form
+        self.noisy, self.exact = form.noisy, not form.soft
+        self.charged = self.noisy or task.variance_weight > 0.0
+        self.bounded = bool(
+            np.isfinite(workspace.arrays["lower"]).any()
+            or np.isfinite(workspace.arrays["upper"]).any()
         )
-        fallback = rejected >= TUNING.rejections
-        curved = newton and not fallback
-        quadratic = quadratic_model(model, functions, at, adjoint, terminal, curved)
-        linearized = time.perf_counter()
-        solves, found = 0, None
-        for _ in range(TUNING.inertia_trials):
-            found, bounds, more = solve_model(
-                model,
-                at,
-                quadratic,
-                bounds,
-                np.zeros_like(model.weight) if released else model.weight,
-                shift if curved else 0.0,
-                solver,
-                gramian,
-                curved,
-            )
-            solves += more
-            if found is not None or not curved:
-                break
-            shift = max(TUNING.shift_up * shift, TUNING.first_shift * unit)
-        solved = time.perf_counter()
-        if found is None:
-            status = Status.SOLVER_FAILED
-            break
-        search = _search(model, functions, w, at, quadratic, found, newton, fallback)
-        new, alpha, accepted = search.new, search.alpha, search.accepted
-        step = alpha**2 * float(np.vdot(model.dt[:, None] * search.e, search.e))
-        radius = alpha**2 * float(np.einsum("k,ki,ki", model.dt, found.d, found.d))
-        done = time.perf_counter()
-        history.append(
-            Iteration(
-                mean=new.lin.x,
-                controls=new.lin.u,
-                effort=new.lin.effort,
-                penalty=new.lin.penalty,
-                running=new.lin.running,
-                variance=np.nan if new.variance is None else new.variance.total / w,
-                merit=search.merit,
-                predicted=search.predicted,
-                actual=search.actual,
-                step=step,
-                trust_radius=radius,
-                trust_multiplier=shift if curved else 0.0,
-                virtual_control=0.0,
-                defect=float(np.max(np.abs(new.lin.defect))),
-                terminal_residual=float(np.max(np.abs(new.lin.g), initial=0.0)),
-                terminal_multiplier=found.terminal,
-                accepted=accepted,
-                solver_iterations=solves,
-                linearize_seconds=linearized - clock + done - solved,
-                solve_seconds=solved - linearized,
-            )
-        )
-        stop = options.callback is not None and options.callback(history[-1])
+        self.side, self.shift, self.floor = 0, 0.0, 0.0
+        self.renewal = tuning.renewal
+        self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
+        self._state_cost = "H_xx" in workspace.arrays and workspace.arrays["H_xx"].any
+
+    def run(self) -> Ending:
+        """Iterate."""
+        ws, task, tuning = self.workspace, self.task, self.tuning
+        ws.set(
+            hinges=1.0, curved=0.0, clipped=0.0, variance_weight=task.variance_weight,
+            closed=1.0 if task.feedback else 0.0, saturation=task.saturation,
+            stiffness=tuning.bound_stiffness * 2.0 * task.longest_dt * task.unit,
+        )  # fmt: skip
+        self.at = self._evaluated(0)
+        if not math.isfinite(sum(self.at)):
+            return Ending(None, 0, 0, self.at)
+        self._measure_end()
+        self._believe(fresh=not task.warm)
+        self._first_effort = self.at.effort
+        status = self._iterate()
+        if self.charged:
+            self.at = self._evaluated(self.side)
+        return Ending(status, self.side, self.tried, self.at)
+
+    def _iterate(self) -> Status:
+        task, tuning = self.task, self.tuning
+        last = settling = math.inf
+        released = task.released
         clock = time.perf_counter()
-        if not accepted:
-            if not newton or fallback:
-                status = Status.STALLED if newton else Status.SOLVER_FAILED
+        for iteration in range(task.max_iterations):
+            effort = self.at.effort
+            if released and (
+                settling < tuning.released * effort or iteration >= tuning.released_steps
+            ):
+                released, last = False, math.inf
+            newton = not released and (
+                iteration >= tuning.free_steps
+                or (self.tried > 0 and settling < tuning.settled * effort)
+            )
+            fallback = tuning.falls_back and self.rejected >= tuning.rejections
+            curved = newton and not fallback
+            if self.noisy and self.bounded:
+                self._confine()
+            self._prepare(curved)
+            linearized = time.perf_counter()
+            step = self._step(curved, released)
+            if step is None:
+                return Status.SOLVER_FAILED
+            solved = time.perf_counter()
+            trial = self._search(step, newton, fallback)
+            now = time.perf_counter()
+            stop = self._tell(step, trial, curved, now - clock - (solved - linearized),
+                              solved - linearized)  # fmt: skip
+            clock = now
+            self.tried += 1
+            if not trial.accepted:
+                status = self._refused(newton, fallback)
+                if status is not None:
+                    return status
+            else:
+                settling = trial.step * task.unit
+                radius = self.shift * self.shift * trial.radius if curved else 0.0
+                self._accepted(step, trial, newton)
+                length = trial.step + radius
+                short = trial.alpha == 1.0 and length + last <= task.tolerance
+                if short and not released and self._consistent():
+                    return Status.CONVERGED
+                last = length
+            if stop:
+                return Status.STOPPED
+        return Status.MAX_ITERATIONS
+
+    # ------------------------------------------------------------------------- at the iterate
+
+    def _evaluated(self, side: int) -> Evaluation:
+        if self.filler is not None:
+            self.filler.point(self.workspace, side)
+        self.workspace.kernel("evaluate")[side]()
+        return Evaluation._make(self.workspace.view("evaluated"))
+
+    def _measure_end(self) -> None:
+        """How far controls of unit cost move the end: scales of the terminal condition."""
+        ws, self.gramian, self.kappa = self.workspace, 0.0, 0.0
+        if self.exact:
+            ws.kernel("gramian")[0]()
+            self.gramian = ws.view("gramian")[0]
+        if self.gramian > 0.0:
+            self.kappa = self.tuning.terminal_curvature * ws.program.dims.q / self.gramian
+
+    def _believe(self, fresh: bool = False) -> None:
+        """Let the belief follow the iterate: what noise is charged, and gains."""
+        if not self.charged:
+            return
+        ws, side = self.workspace, self.side
+        self._project()
+        if not self.noisy:
+            ws.kernel("weights")[side]()
+            return
+        ws.kernel("spread")[side]()
+        ws.set(renewal=1.0 if fresh else self.renewal)
+        ws.kernel("stakes")[side]()
+        ws.kernel("weights")[side]()
+        if self.task.feedback:
+            ws.kernel("spread")[side]()
+
+    def _project(self) -> None:
+        """The nearest semidefinite Hessian of the state cost, where there is one."""
+        ws = self.workspace
+        H = ws.at(self.side, "H_xx")
+        if H.any():
+            ws.at(self.side, "H_psd")[:] = nearest_semidefinite(H)
+
+    def _confine(self) -> None:
+        """Bring the controls within the bounds that the gains of now leave.
+
+        Bounds follow the gains, so that the last step's controls may lie outside: a step back costs
+        more than it gains, and measured from there none would be accepted.
+        """
+        ws, here, there = self.workspace, self.side, 1 - self.side
+        u = ws.at(here, "u")
+        inside = np.clip(u, ws.arrays["lower"], ws.arrays["upper"])
+        if np.array_equal(inside[:-1], u[:-1]):
+            return
+        for name in ("x", "lam", "nu"):
+            ws.at(there, name)[:] = ws.at(here, name)
+        ws.at(there, "u")[:] = inside
+        moved = self._evaluated(there)
+        if math.isfinite(sum(moved)):
+            self.side, self.at = there, moved
+
+    def _prepare(self, curved: bool) -> None:
+        """What the model needs beyond the point itself."""
+        self._project()
+        if curved and self.filler is not None:
+            self.filler.second(self.workspace, self.side)
+
+    # ------------------------------------------------------------------------------- the step
+
+    def _step(self, curved: bool, released: bool) -> _Step | None:
+        """The model's step: bounds settle, and the shift grows until the model is convex."""
+        ws, tuning, gramian = self.workspace, self.tuning, self.gramian
+        kappa = self.kappa if curved else 0.0
+        ws.set(
+            hinges=0.0 if released else 1.0, curved=1.0 if curved else 0.0, kappa=kappa,
+            softness=1e-13 * gramian / (1.0 + kappa * gramian), clipped=0.0,
+        )  # fmt: skip
+        solves = 0
+        for _ in range(tuning.inertia_trials):
+            ws.set(damping=self.shift if curved else 0.0)
+            model, promise, rounds = self._settle_bounds()
+            solves += rounds
+            if promise is not None:
+                return _Step(model, promise, solves)
+            if not curved:
+                return None
+            self.shift = max(tuning.shift_up * self.shift, tuning.first_shift * self.task.unit)
+        return None
+
+    def _settle_bounds(self) -> tuple[Model, Promise | None, int]:
+        """Solve the LQ problem until the bounds it passes are those it was solved with."""
+        ws, side, rounds = self.workspace, self.side, self.tuning.bound_rounds
+        backward, forward = ws.kernel("backward")[side], ws.kernel("forward")[side]
+        modelled, promised = ws.view("modelled"), ws.view("promised")
+        for attempt in range(1, rounds + 1):
+            backward()
+            model = Model._make(modelled)
+            if model.bad != 0.0:
+                return model, None, attempt
+            forward()
+            promise = Promise._make(promised)
+            if not math.isfinite(promise.total):
+                return model, None, attempt
+            if promise.changed == 0.0:
+                return model, promise, attempt
+            if attempt < rounds:
+                ws.arrays["held"][:] = ws.arrays["passed"]
+        # The set does not settle: clip the controls and let the states follow.
+        ws.set(clipped=1.0)
+        forward()
+        ws.set(clipped=0.0)
+        return model, Promise._make(promised), rounds
+
+    def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
+        """Shorten the step until the merit function falls; free steps are taken whole."""
+        model, promise, tuning = step
+        tuning, at = self.tuning, self.at
+        price, dear = 0.5 * promise.price, 0.5 * model.dearest
+        lacking = price * promise.gap + dear * promise.miss
+        gained = promise.pull - promise.change
+        factor = max(1.0, -gained / (0.75 * lacking)) if lacking > 0.0 else 1.0
+        before = at.effort + at.running + model.charged + promise.pull + factor * lacking
+        predicted = gained + factor * lacking
+        noise = tuning.noise * (1.0 + abs(before))
+        most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
+        alpha = 1.0 if promise.length <= most else math.sqrt(most / promise.length)
+        trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
+        ws, there = self.workspace, 1 - self.side
+        shift = ws.kernel("shift")[self.side]
+        for trial in range(trials):
+            ws.set(alpha=alpha)
+            shift()
+            new = self._evaluated(there)
+            merit = new.effort + new.running + new.charged + new.pull
+            merit += factor * (price * new.gap + dear * new.miss)
+            actual = before - merit
+            accepted = math.isfinite(merit) and (
+                not newton
+                or (predicted <= noise and actual >= -noise)
+                or actual >= tuning.armijo * alpha * predicted
+            )
+            if accepted or trial == trials - 1:
                 break
-            rejected += 1
-            shift = max(TUNING.shift_up * shift, 0.1 * TUNING.first_shift * unit)
-        else:
-            settling, length = step * unit, step
-            # A short step that a shift made short proves nothing: the force it stands for,
-            # p¹ (x − x_k), must vanish too.
-            step += shift**2 * radius if curved else 0.0
-            rejected = 0
-            if newton:
-                circling.notice(length)
-                shift = max(_next_shift(shift, unit, search), circling.floor)
-            at, adjoint, terminal = new, found.adjoint, found.terminal
-            short = alpha == 1.0 and step + last <= options.tolerance
-            if short and not released and _consistent(at.lin):
-                status = Status.CONVERGED
-                break
-            last = step
-        if stop:
-            status = Status.STOPPED
-            break
-    return Outcome.at(
-        at.lin, model, w, status=status, adjoint=adjoint, terminal=terminal,
-        history=tuple(history),
-    )  # fmt: skip
+            alpha *= 0.5
+        square = alpha * alpha
+        return _Trial(
+            new, alpha, accepted, merit, predicted, actual, noise, square * promise.step,
+            square * promise.radius,
+        )  # fmt: skip
+
+    # -------------------------------------------------------------------------- what follows
+
+    def _refused(self, newton: bool, fallback: bool) -> Status | None:
+        """Shorten the next step; a status where there is no point in trying it."""
+        tuning, unit = self.tuning, self.task.unit
+        if not newton:
+            return Status.SOLVER_FAILED
+        if fallback:
+            return Status.STALLED
+        self.rejected += 1
+        self.shift = max(tuning.shift_up * self.shift, 0.1 * tuning.first_shift * unit)
+        return (
+            Status.STALLED if not tuning.falls_back and self.rejected >= tuning.rejections else None
+        )
+
+    def _accepted(self, step: _Step, trial: _Trial, newton: bool) -> None:
+        """Make the candidate the iterate; adapt shift and renewal."""
+        tuning, unit = self.tuning, self.task.unit
+        self.rejected = 0
+        if newton:
+            least = tuning.first_shift * unit
+            self.stale += 1
+            if trial.step < 0.5 * self.shortest:
+                self.shortest, self.stale = trial.step, 0
+                self.floor /= tuning.shift_up
+                if self.floor < 0.01 * least:
+                    self.floor = 0.0
+            elif self.stale == tuning.patience:  # round in circles
+                self.floor, self.stale = max(tuning.shift_up * self.floor, 0.1 * least), 0
+                self.renewal = max(0.5 * self.renewal, tuning.least_renewal)
+            self.shift = max(self._next_shift(trial), self.floor)
+        self.side, self.at = 1 - self.side, trial.new
+        self._believe()
+
+    def _next_shift(self, trial: _Trial) -> float:
+        """Less after a step that did what the model said, more after one that did not."""
+        tuning, shift = self.tuning, self.shift
+        least = 0.01 * tuning.first_shift * self.task.unit
+        fulfilled = trial.actual > 0.7 * trial.predicted or trial.predicted <= trial.noise
+        if trial.alpha == 1.0 and fulfilled:
+            return shift / tuning.shift_down if shift > least else 0.0
+        if trial.alpha < 0.3 or trial.actual < 0.1 * trial.predicted:
+            return max(2.0 * shift, least)
+        return shift
+
+    def _consistent(self) -> bool:
+        """Whether the end is where it must be and the mean is, to first order, the controls' path."""
+        at, tuning = self.at, self.tuning
+        size = 1.0 + at.size
+        feasible = at.residual <= tuning.feasibility * size
+        return feasible and at.inconsistency <= tuning.consistency * size
+
+    def _tell(
+        self, step: _Step, trial: _Trial, curved: bool, linearizing: float, solving: float
+    ) -> bool:
+        """Report the step; whether to stop."""
+        if self.watch is None:
+            return False
+        new, w = trial.new, self.task.variance_weight
+        row = StepTaken(
+            effort=new.effort, penalty=new.penalty, running=new.running,
+            variance=(new.charged - new.penalty) / w if w > 0.0 else math.nan,
+            merit=trial.merit, predicted=trial.predicted, actual=trial.actual, step=trial.step,
+            trust_radius=trial.radius, trust_multiplier=self.shift if curved else 0.0,
+            defect=new.defect, terminal_residual=new.residual, accepted=trial.accepted,
+            solver_iterations=step.solves, linearize_seconds=linearizing, solve_seconds=solving,
+        )  # fmt: skip
+        return bool(self.watch(row, 1 - self.side))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Search:
+class _Step(NamedTuple):
+    """The model, what its step promises, and LQ problems solved for it."""
+
+    model: Model
+    promise: Promise
+    solves: int
+
+
+class _Trial(NamedTuple):
     """Where a line search ended."""
 
-    new: Iterate
-    e: Array
+    new: Evaluation
     alpha: float
     accepted: bool
     merit: float
     predicted: float
     actual: float
     noise: float
+    step: float
+    radius: float
 
 
-def _search(
-    model: Model,
-    functions: Functions,
-    w: float,
-    at: Iterate,
-    quadratic: Quadratic,
-    found: LqSolution,
-    newton: bool,
-    fallback: bool,
-) -> _Search:
-    """Shorten the step until the merit function falls; free steps are taken whole."""
-    lin, dt, d = at.lin, model.dt, found.d
-    e = np.clip(lin.u + found.e, model.lower, model.upper) - lin.u
-    value = at.cost - lin.penalty
-    value += float(np.vdot(quadratic.q + 0.5 * times(quadratic.Q, d), d))
-    value += float(np.vdot(quadratic.r + 0.5 * times(quadratic.R, e), e))
-    if quadratic.S is not None:
-        value += float(np.vdot(e[1:], times(quadratic.S[1:], d[:-1])))
-    c = np.maximum(times(lin.C, d) + lin.c, 0.0)
-    value += float(np.vdot(dt[:, None] * model.weight, c * c))
-    price = 0.5 * float(np.max(np.abs(found.adjoint)))
-    dear = 0.5 * float(np.max(np.abs(found.terminal), initial=0.0))
-
-    def lagrangian(point: Iterate) -> tuple[float, float]:
-        """Cost + λᵀf + νᵀg, and what is lacking, priced."""
-        f, g = point.lin.defect, point.lin.g
-        lacking = price * float(np.abs(f).sum()) + dear * float(np.abs(g).sum())
-        cost = point.lin.effort + point.lin.penalty + point.lin.running
-        if at.weights is not None:
-            cost += float(np.vdot(at.weights @ point.lin.sigma, point.lin.sigma))
-        return cost + float(np.vdot(found.adjoint, f) + np.vdot(found.terminal, g)), lacking
-
-    before, lacking = lagrangian(at)
-    gain = before - value
-    factor = max(1.0, -gain / (0.75 * lacking)) if lacking > 0.0 else 1.0
-    before += factor * lacking
-    predicted = gain + factor * lacking
-    noise = TUNING.noise * (1.0 + abs(before))
-    alpha, trials = 1.0, (TUNING.long_searches if fallback else TUNING.searches) if newton else 1
-    for trial in range(trials):
-        x = lin.x.copy()
-        x[1:] += alpha * d
-        new = evaluate(model, functions, w, x, lin.u + alpha * e)
-        merit, actual, accepted = np.inf, -np.inf, False
-        if new.finite:
-            merit, rest = lagrangian(new)
-            merit += factor * rest
-            actual = before - merit
-            accepted = (
-                not newton
-                or (predicted <= noise and actual >= -noise)
-                or actual >= TUNING.armijo * alpha * predicted
-            )
-        if accepted or trial == trials - 1:
-            break
-        alpha *= 0.5
-    return _Search(new, e, alpha, accepted, merit, predicted, actual, noise)
-
-
-class _Circling:
-    """Notices steps that no longer become shorter, and keeps the shift from falling."""
-
-    def __init__(self, unit: float) -> None:
-        self.floor = 0.0
-        self._shortest, self._stale, self._unit = np.inf, 0, unit
-
-    def notice(self, step: float) -> None:
-        """One more Newton step of this length, ∫‖Δu‖² dt."""
-        least = TUNING.first_shift * self._unit
-        self._stale += 1
-        if step < 0.5 * self._shortest:
-            self._shortest, self._stale = step, 0
-            self.floor /= TUNING.shift_up
-            if self.floor < 0.01 * least:
-                self.floor = 0.0
-        elif self._stale == TUNING.patience:
-            self.floor, self._stale = max(TUNING.shift_up * self.floor, 0.1 * least), 0
-
-
-def _next_shift(shift: float, unit: float, search: _Search) -> float:
-    """Less after a step that did what the model said, more after one that did not."""
-    if search.alpha == 1.0 and (
-        search.actual > 0.7 * search.predicted or search.predicted <= search.noise
-    ):
-        return shift / TUNING.shift_down if shift > 0.01 * TUNING.first_shift * unit else 0.0
-    if search.alpha < 0.3 or search.actual < 0.1 * search.predicted:
-        return max(2.0 * shift, 0.01 * TUNING.first_shift * unit)
-    return shift
-
-
-def _consistent(lin: Linearization) -> bool:
-    """Whether the terminal condition holds and the mean is, to first order, the controls' path."""
-    size = 1.0 + float(np.max(np.abs(lin.x)))
-    if np.max(np.abs(lin.g), initial=0.0) > TUNING.feasibility * size:
-        return False
-    return inconsistency(lin, np.inf) <= TUNING.consistency * size
+def iterate(
+    workspace: Workspace,
+    task: Task,
+    tuning: Tuning,
+    filler: Filler | None = None,
+    watch: Watcher | None = None,
+) -> Ending:
+    """Run the iteration on a loaded workspace; see :class:`Iteration`."""
+    iteration: Any = Iteration(workspace, task, tuning, filler, watch)
+    return iteration.run()

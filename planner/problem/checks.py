@@ -6,8 +6,7 @@
   uncertain if its start is, if its row of σ is not zero, or if its drift depends on an uncertain
   one. The adjoint weights of the penalty leave out how σ then spreads with Σ; covariances and
   expected costs do not (:mod:`.moments`, :mod:`.expected.belief`), and need no such thing;
-* on request, every Jacobian against differences: this finds wrong analytic ones, and complex
-  steps through functions that are not analytic (abs, conj, ...).
+* on request, every Jacobian against differences: this finds wrong ones among those given.
 
 Points are the guess and seeded random ones around it; those where the functions are not finite
 are passed over here (along the guess itself they are an error later on).
@@ -15,13 +14,14 @@ are passed over here (along the guess itself they are an error later on).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from slipcar.planner.problem.jacobians import differences, richardson
 from slipcar.planner.problem.model import Model
-from slipcar.planner.problem.recent import Recent
 
 Array = np.ndarray
 
@@ -32,29 +32,52 @@ _PATTERN, _SIGMA, _AFFINE, _JACOBIAN = 1e-12, 1e-9, 1e-7, 1e-5
 _quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-#: Problems that passed, and what was found out about their diffusion.
-_PASSED = Recent()
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What the structure of traced functions rules out, whatever their numbers.
+
+    Attributes:
+        affine: whether the drift is affine in the control.
+        depends: whether entry i of the drift can depend on state j, (n, n).
+        noisy: whether noise can reach a state directly, (n,).
+        sigma_depends: whether the diffusion can depend on a state, (n,).
+    """
+
+    affine: bool
+    depends: Array
+    noisy: Array
+    sigma_depends: Array
+
+    def settle(self, start_covariance: Array) -> bool:
+        """Whether nothing is left to be looked at: affine, and no noise in what σ depends on."""
+        uncertain = self.noisy | (np.diag(start_covariance) > 0.0)
+        for _ in range(len(uncertain)):
+            grown = uncertain | (self.depends & uncertain).any(axis=1)
+            if (grown == uncertain).all():
+                break
+            uncertain = grown
+        return self.affine and not (uncertain & self.sigma_depends).any()
 
 
-def check_once(model: Model, x: Array, u: Array, *, charged: bool) -> None:
-    """:func:`check_assumptions`, unless this very (immutable) problem has passed it lately.
+def check(model: Model, x: Array, u: Array, facts: Facts | None, *, charged: bool) -> None:
+    """What the method assumes, by the structure of functions or, where that leaves doubt, at points.
 
     Args:
         model: the problem.
         x: states of the guess, (N, n).
         u: its controls, (N−1, m).
+        facts: of a trace that was looked at before; None looks at points.
         charged: whether `variance_weight` is to charge the noise.
 
     Raises:
         ValueError: naming the function, the entry and what is assumed of it.
     """
-    found = _PASSED.get(model.problem)
-    if found is None:
-        found = check_assumptions(model, x, u)
-        _PASSED.keep(model.problem, found)
-    if charged and found:
+    if facts is not None and facts.settle(model.start_covariance):
+        return
+    flaw = check_assumptions(model, x, u)
+    if charged and flaw:
         raise ValueError(
-            f"{found}. variance_weight (1 unless told otherwise) charges the noise with σ at the "
+            f"{flaw}. variance_weight (1 unless told otherwise) charges the noise with σ at the "
             f"mean, which holds only if σ depends on states that stay deterministic (paper §6.1). "
             f"Plan with expected=True, feedback=True or risk=..., whose covariance counts what "
             f"noisy states do to σ, or with variance_weight=0"
@@ -111,14 +134,14 @@ def _checked_shapes(model: Model, t: Array, x: Array, u: Array) -> tuple[Array, 
         ("terminal(x)", model.terminal(x), (q,)),
         ("terminal_jacobian(x)", model.terminal_jacobian(x), (q, n)),
     ]
-    if model.state_cost is not None and model.state_cost_derivatives is not None:
+    if model.state_cost is not None:
         gradient, hessian = model.state_cost_derivatives(t, x)
         answers += [
             ("state_cost(t, x)", model.state_cost(t, x), ()),
             ("state_cost_derivatives(t, x)[0]", gradient, (n,)),
             ("state_cost_derivatives(t, x)[1]", hessian, (n, n)),
         ]
-    if model.control_cost is not None and model.control_cost_jacobian is not None:
+    if model.control_cost is not None:
         answers += [
             ("control_cost(t, x)", model.control_cost(t, x), (m,)),
             ("control_cost_jacobian(t, x)", model.control_cost_jacobian(t, x), (m, n)),
@@ -184,7 +207,7 @@ def _reach(path: dict[int, str], i: int, by: int) -> int:
 
 @_quiet
 def check_derivatives(model: Model, x: Array, u: Array) -> None:
-    """Every Jacobian, analytic or complex-step, against central differences.
+    """Every Jacobian, given or traced, against central differences.
 
     Raises:
         ValueError: naming the function, the entry and both values.
@@ -203,13 +226,13 @@ def check_derivatives(model: Model, x: Array, u: Array) -> None:
     )  # fmt: skip
     _compare(model, "terminal_jacobian", "", model.terminal_jacobian(y), model.terminal, y)
     H, derivatives = model.state_cost, model.state_cost_derivatives
-    if H is not None and derivatives is not None:
+    if H is not None:
         gradient, hessian = derivatives(t, y)
         name = "state_cost_derivatives"
         _compare(model, name, "[0]", gradient, lambda z: H(t, z), y)
         _compare(model, name, "[1]", hessian, lambda z: derivatives(t, z)[0], y)
     linear, jacobian = model.control_cost, model.control_cost_jacobian
-    if linear is not None and jacobian is not None:
+    if linear is not None:
         _compare(model, "control_cost_jacobian", "", jacobian(t, y), lambda z: linear(t, z), y)
 
 
@@ -218,35 +241,21 @@ def _compare(
 ) -> None:
     """Raise where a Jacobian (P, ..., n) is not what differences of f with respect to x are."""
     given = np.asarray(given)
-    h = 1e-4 * (1.0 + np.abs(x))
-    wide, narrow = _differences(f, x, h), _differences(f, x, 0.5 * h)
-    best = (4.0 * narrow - wide) / 3.0
+    best, spread = richardson(lambda step: differences(f, x, step))
     size = np.maximum(np.abs(given), np.abs(best))
-    allowed = _JACOBIAN * (size + _largest(size)) + 10.0 * np.abs(narrow - wide)
+    allowed = _JACOBIAN * (size + _largest(size)) + 10.0 * spread
     allowed += 1e-9 * (1.0 + np.nanmax(np.abs(np.asarray(f(x))), initial=0.0))
     wrong = np.abs(given - best) > allowed
     if not wrong.any():
         return
     index = tuple(int(i) for i in np.argwhere(wrong)[0])
     analytic = getattr(model.problem, name, None) is not None
-    source = "your function" if analytic else "by complex step"
-    advice = "" if analytic else "; is the function analytic? otherwise give its derivative"
+    source = "your function" if analytic else "traced"
+    advice = "" if analytic else "; is the function smooth there? otherwise give its derivative"
     raise ValueError(
         f"{name}{part}{list(index[1:])} ({source}) is {given[index]:.9g} at "
         f"{_show(x[index[0]])}, but differences give {best[index]:.9g}{advice}"
     )
-
-
-def _differences(f: Callable[[Array], Array], x: Array, h: Array) -> Array:
-    columns = []
-    for i in range(x.shape[1]):
-        ahead, behind = x.copy(), x.copy()
-        ahead[:, i] += h[:, i]
-        behind[:, i] -= h[:, i]
-        rise = np.asarray(f(ahead)) - np.asarray(f(behind))
-        width = (ahead[:, i] - behind[:, i]).reshape(-1, *[1] * (rise.ndim - 1))
-        columns.append(rise / width)
-    return np.stack(columns, axis=-1)
 
 
 def _largest(size: Array) -> Array:

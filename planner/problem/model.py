@@ -1,93 +1,42 @@
-"""What `plan` solves: the protocol a problem satisfies, and its checked, completed form.
+"""A problem, checked at the boundary: its numbers as arrays, its functions with their derivatives.
 
-    minimise  E ∫₀ᵀ [ uᵀRu + H(t,x) + ℓ(t,x)ᵀu + Σ_i w_i max(0, c_i(t,x))² ] dt
-    s.t.      dx = b(t,x,u) dt + σ(t,x) dB,   x(0) = start,   E[g(x(T))] = 0,
-              lower ≤ u ≤ upper,   ‖u‖₂ ≤ radius
-
-b is affine in u; x(0) may be uncertain (`start_covariance`). Where `variance_weight` is to charge
-the noise, σ may depend only on states that stay certain (paper §6.1).
-Costs of the state are charged at nodes 1..N−1, each with the dt of the interval that ends there,
-those of the control with the dt of its interval; both are taken at the mean, and the noise is
-charged by `variance_weight` in :func:`slipcar.planner.plan`.
-`slipcar.envs.Scenario` satisfies the protocol; the two packages do not know each other.
+A problem is remembered by its identity while it lives and by the numbers it names: those are looked
+at in every call, its functions never. What they compute is what they compute now.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import weakref
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
+from slipcar.planner.problem import numbers
 from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
-from slipcar.planner.problem.derivatives import complex_step_jacobian, gradient_and_hessian
 from slipcar.planner.problem.integrators import change
-from slipcar.planner.problem.recent import Recent
+from slipcar.planner.problem.jacobians import Jacobians
+from slipcar.planner.problem.numbers import finite
+from slipcar.planner.problem.protocol import Problem
 
 Array = np.ndarray
+_REQUIRED = ("start", "times", "control_weight", "drift", "diffusion", "terminal")
+#: Members that are numbers.
+_NUMBERS = (
+    "start", "times", "control_weight", "control_bounds", "control_radius", "penalty_weight",
+    "start_covariance",
+)  # fmt: skip
+_OPTIONAL = ("penalty", "constraint", "state_cost", "control_cost")
 
 
-@runtime_checkable
-class Problem(Protocol):
-    """A stochastic optimal control problem, as functions batched over leading axes.
-
-    The members below are required. These are used when they are there:
-
-    * `drift_jacobian(t, x, u)` -> ∂b/∂x (..., n, n), ∂b/∂u (..., n, m); complex-step otherwise,
-      for which `drift` must be analytic and let complex arrays pass. The same holds for
-      `diffusion_jacobian(t, x)` -> (..., n, d, n), `terminal_jacobian(x)` -> (..., q, n) and
-      `penalty_jacobian(t, x)` -> (..., p, n).
-    * `penalty(t, x)` -> c (..., p) with `penalty_weight` (p,): the cost Σ w max(0, c)².
-    * `state_cost(t, x)` -> H (...,): any twice differentiable running cost. The sub-problem
-      has its gradient and its Hessian, projected to positive semidefinite: nothing changes where
-      H is convex. `state_cost_derivatives(t, x)` -> gradient (..., n), Hessian (..., n, n);
-      otherwise complex-step gradients and their central differences.
-    * `control_cost(t, x)` -> ℓ (..., m): the running cost ℓᵀu, affine in u (L of the paper),
-      linearised as the paper does. `control_cost_jacobian(t, x)` -> (..., m, n).
-    * `control_bounds`: None, (m,) for |u| ≤ bound, or (2, m) for lower and upper.
-    * `control_radius`: None, or r > 0 for ‖u‖₂ ≤ r; box and ball may be combined.
-    * `constraint(t, x)` -> h (..., p): violated where positive, for `risk` and `risk_price`; its
-      derivatives are traced or taken by complex steps. It costs nothing otherwise.
-    * `terminal_weight` (q,) ≥ 0: W of E gᵀWg, what plans with feedback charge instead of asking
-      for g(μ) = 0.
-    * `initial_guess()` -> states (N, n), controls (N−1, m); otherwise the uncontrolled path
-      (or the start at all times, if that path grows without bound).
-    * `start_covariance` (n, n): of x(0), symmetric positive semidefinite, with the mean `start`;
-      zero otherwise.
-    * `angles`: state components of period 2π, so that feedback wraps their errors.
-    * `decode_observation(obs)` -> (t, x) and `encode_control(u)` -> action, for controllers
-      that act in an environment.
-
-    Attributes:
-        start: x(0), (n,).
-        times: nodes of the time grid, (N,), increasing, N ≥ 2 [s].
-        control_weight: R, (m, m), symmetric positive definite (assumption A₄).
-    """
-
-    @property
-    def start(self) -> Array: ...  # noqa: D102
-    @property
-    def times(self) -> Array: ...  # noqa: D102
-    @property
-    def control_weight(self) -> Array: ...  # noqa: D102
-
-    def drift(self, t: Array, x: Array, u: Array) -> Array:
-        """b(t, x, u): times (...,), states (..., n), controls (..., m) -> (..., n)."""
-        ...
-
-    def diffusion(self, t: Array, x: Array) -> Array:
-        """σ(t, x): (..., n, d) for d Brownian motions."""
-        ...
-
-    def terminal(self, x: Array) -> Array:
-        """g(x): states (..., n) -> (..., q); E[g(x(T))] = 0."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Model:
     """A problem, checked and completed: what the planner computes with.
+
+    Its functions are the problem's, its derivatives the problem's or exact ones
+    (:mod:`.jacobians`), all batched over leading axes.
 
     Attributes:
         problem: the object it was made from.
@@ -100,18 +49,6 @@ class Model:
         upper: upper control bounds, (m,).
         radius: of the ball of controls, inf where there is none.
         weight: penalty weights, (p,).
-        drift: (t, x, u) -> (..., n).
-        drift_jacobian: (t, x, u) -> ((..., n, n), (..., n, m)).
-        diffusion: (t, x) -> (..., n, d).
-        diffusion_jacobian: (t, x) -> (..., n, d, n).
-        penalty: (t, x) -> (..., p).
-        penalty_jacobian: (t, x) -> (..., p, n).
-        terminal: x -> (..., q).
-        terminal_jacobian: x -> (..., q, n).
-        state_cost: (t, x) -> (...,), or None.
-        state_cost_derivatives: (t, x) -> ((..., n), (..., n, n)), or None.
-        control_cost: (t, x) -> (..., m), or None.
-        control_cost_jacobian: (t, x) -> (..., m, n), or None.
         own_guess: instead of the problem's `initial_guess`, where the start is another.
         integrator: of the mean, `"euler"` or `"rk4"`; see :mod:`.integrators`.
     """
@@ -126,35 +63,54 @@ class Model:
     upper: Array
     radius: float
     weight: Array
-    drift: Callable[[Array, Array, Array], Array]
-    drift_jacobian: Callable[[Array, Array, Array], tuple[Array, Array]]
-    diffusion: Callable[[Array, Array], Array]
-    diffusion_jacobian: Callable[[Array, Array], Array]
-    penalty: Callable[[Array, Array], Array]
-    penalty_jacobian: Callable[[Array, Array], Array]
-    terminal: Callable[[Array], Array]
-    terminal_jacobian: Callable[[Array], Array]
-    state_cost: Callable[[Array, Array], Array] | None = None
-    state_cost_derivatives: Callable[[Array, Array], tuple[Array, Array]] | None = None
-    control_cost: Callable[[Array, Array], Array] | None = None
-    control_cost_jacobian: Callable[[Array, Array], Array] | None = None
     integrator: str = "euler"
     own_guess: Callable[[], tuple[Array, Array]] | None = None
 
-    @property
+    @functools.cached_property
     def state_dim(self) -> int:
         """Dimension of the state, n."""
         return len(self.start)
 
-    @property
+    @functools.cached_property
     def control_dim(self) -> int:
         """Dimension of the control, m."""
         return len(self.R)
 
-    @property
+    @functools.cached_property
     def bounded(self) -> bool:
         """Whether any control bound is finite."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+
+    @functools.cached_property
+    def R_inverse(self) -> Array:
+        """R⁻¹, (m, m)."""
+        return np.linalg.inv(self.R)
+
+    @functools.cached_property
+    def unit(self) -> float:
+        """The largest diagonal entry of R: the scale of what is added to Hessians."""
+        return float(self.R.diagonal().max())
+
+    @functools.cached_property
+    def longest_dt(self) -> float:
+        """The longest interval [s]."""
+        return float(self.dt.max())
+
+    @functools.cached_property
+    def jacobians(self) -> Jacobians:
+        """Derivatives of the functions as they are now."""
+        return Jacobians(self.problem, self.state_dim, self.control_dim)
+
+    @property
+    def knows_jacobians(self) -> bool:
+        """Whether derivatives of its functions were asked for."""
+        return "jacobians" in vars(self)
+
+    def started(self, start: Array, own_guess: Callable[[], tuple[Array, Array]] | None) -> Model:
+        """The same problem from another state: what is known of the rest stays known."""
+        copy = object.__new__(Model)
+        vars(copy).update(vars(self), start=start, own_guess=own_guess)
+        return copy
 
     def admissible(self, u: Array) -> Array:
         """The nearest controls within bounds and ball, (..., m)."""
@@ -162,27 +118,87 @@ class Model:
 
     def guess(self) -> tuple[Array, Array]:
         """The problem's own, else the uncontrolled path, else (it escapes) resting at the start."""
-        N, n, m = len(self.times), self.state_dim, self.control_dim
         own = self.own_guess or getattr(self.problem, "initial_guess", None)
-        if own is not None:
-            x, u = own()
-        else:
-            u = self.admissible(np.zeros((N - 1, m)))
-            x = np.empty((N, n))
-            x[0] = self.start
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                for k in range(N - 1):
-                    t, dt = self.times[k], self.dt[k]
-                    moved = change(self.integrator, self.drift, t, dt, x[k], u[k])
-                    if np.shape(moved) != (n,):
-                        raise ValueError(
-                            f"drift(t, x, u) must have shape ({n},) for one point, not "
-                            f"{np.shape(moved)}"
-                        )
-                    x[k + 1] = x[k] + moved
-            if not np.isfinite(x).all():
-                x[:] = self.start
-        return checked_trajectory(self, x, u)
+        return checked_trajectory(self, *(own() if own is not None else self._uncontrolled()))
+
+    def _uncontrolled(self) -> tuple[Array, Array]:
+        N, n = len(self.times), self.state_dim
+        u = self.admissible(np.zeros((N - 1, self.control_dim)))
+        x = np.empty((N, n))
+        x[0] = self.start
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            for k in range(N - 1):
+                t, dt = self.times[k], self.dt[k]
+                moved = change(self.integrator, self.drift, t, dt, x[k], u[k])
+                if np.shape(moved) != (n,):
+                    raise ValueError(
+                        f"drift(t, x, u) must have shape ({n},) for one point, not "
+                        f"{np.shape(moved)}"
+                    )
+                x[k + 1] = x[k] + moved
+        if not np.isfinite(x).all():
+            x[:] = self.start
+        return x, u
+
+    # ----------------------------------------------------------- functions of times and states
+
+    def drift(self, t: Array, x: Array, u: Array) -> Array:
+        """b, (..., n)."""
+        return self.problem.drift(t, x, u)
+
+    def drift_jacobian(self, t: Array, x: Array, u: Array) -> tuple[Array, Array]:
+        """∂b/∂x (..., n, n) and ∂b/∂u (..., n, m)."""
+        return self.jacobians.drift(t, x, u)
+
+    def diffusion(self, t: Array, x: Array) -> Array:
+        """σ, (..., n, d)."""
+        return np.asarray(self.problem.diffusion(t, x))
+
+    def diffusion_jacobian(self, t: Array, x: Array) -> Array:
+        """∂σ/∂x, (..., n, d, n)."""
+        return self.jacobians.state("diffusion", t, x)
+
+    def penalty(self, t: Array, x: Array) -> Array:
+        """c, (..., p)."""
+        if not self.has("penalty"):
+            return np.zeros((*x.shape[:-1], 0))
+        return np.asarray(self.problem.penalty(t, x))  # type: ignore[attr-defined]
+
+    def penalty_jacobian(self, t: Array, x: Array) -> Array:
+        """∂c/∂x, (..., p, n)."""
+        if not self.has("penalty"):
+            return np.zeros((*x.shape[:-1], 0, x.shape[-1]))
+        return self.jacobians.state("penalty", t, x)
+
+    def terminal(self, x: Array) -> Array:
+        """g, (..., q)."""
+        return np.asarray(self.problem.terminal(x))
+
+    def terminal_jacobian(self, x: Array) -> Array:
+        """∂g/∂x, (..., q, n)."""
+        return self.jacobians.state("terminal", np.zeros(x.shape[:-1]), x)
+
+    def has(self, name: str) -> bool:
+        """Whether the problem has this optional function."""
+        return getattr(self.problem, name, None) is not None
+
+    @property
+    def state_cost(self) -> Callable[[Array, Array], Array] | None:
+        """(t, x) -> H (...,), or None."""
+        return getattr(self.problem, "state_cost", None)
+
+    def state_cost_derivatives(self, t: Array, x: Array) -> tuple[Array, Array]:
+        """∂H/∂x (..., n) and ∂²H/∂x² (..., n, n)."""
+        return self.jacobians.state_cost(t, x)
+
+    @property
+    def control_cost(self) -> Callable[[Array, Array], Array] | None:
+        """(t, x) -> ℓ (..., m), or None."""
+        return getattr(self.problem, "control_cost", None)
+
+    def control_cost_jacobian(self, t: Array, x: Array) -> Array:
+        """∂ℓ/∂x, (..., m, n)."""
+        return self.jacobians.state("control_cost", t, x)
 
 
 def penalty_cost(model: Model, x: Array) -> float:
@@ -198,194 +214,136 @@ def checked_trajectory(model: Model, x: Any, u: Any) -> tuple[Array, Array]:
         ValueError: for a wrong shape or a non-finite entry.
     """
     N = len(model.times)
-    x = _finite("guess: states", x, (N, model.state_dim)).copy()
-    u = _finite("guess: controls", u, (N - 1, model.control_dim))
+    x = finite("guess: states", x, (N, model.state_dim)).copy()
+    u = finite("guess: controls", u, (N - 1, model.control_dim))
     x[0] = model.start
     return x, model.admissible(u)
 
 
-_MODELS = Recent()
+_known: dict[int, tuple[weakref.ref[Any], Any, Model]] = {}
 
 
 def model_of(problem: Problem) -> Model:
-    """Check a problem at the boundary and complete it with complex-step Jacobians.
-
-    For an immutable problem (a frozen dataclass of immutable values) that was seen lately this
-    is the same model as then.
+    """Check a problem at the boundary and complete it.
 
     Raises:
         TypeError: if a required member is missing, naming it.
         ValueError: if a shape, value or function result is wrong, naming it.
     """
-    model = _MODELS.get(problem)
-    if model is None:
-        model = _checked(problem)
-        _MODELS.keep(problem, model)
+    named = _signature(problem)
+    known = _known.get(id(problem))
+    if known is not None and known[0]() is problem and known[1] == named:
+        return _renewed(known[2], problem)
+    model = _checked(problem)
+    try:
+        reference = weakref.ref(problem, lambda _, key=id(problem): _known.pop(key, None))
+    except TypeError:  # an object that cannot be referred to weakly is checked anew each time
+        return model
+    # The model refers to its problem: kept without it, lest the problem live for ever.
+    _known[id(problem)] = (reference, named, _renewed(model, None))
     return model
 
 
-def _checked(problem: Problem) -> Model:
-    required = ("start", "times", "control_weight", "drift", "diffusion", "terminal")
-    missing = [name for name in required if not hasattr(problem, name)]
+def _signature(problem: Any) -> tuple[Any, ...]:
+    """The numbers that a problem names, and which optional functions it has."""
+    values: list[Any] = []
+    for name in _NUMBERS:
+        value = getattr(problem, name, None)
+        if value is not None:
+            array = np.asarray(value)
+            value = (array.shape, array.dtype.str, array.tobytes())
+        values.append(value)
+    return (*values, *(getattr(problem, name, None) is None for name in _OPTIONAL))
+
+
+def _renewed(model: Model, problem: Any) -> Model:
+    """A copy for a problem that knows no derivatives yet: functions may have changed since."""
+    copy = object.__new__(Model)
+    vars(copy).update(vars(model), problem=problem)
+    vars(copy).pop("jacobians", None)
+    return copy
+
+
+def _checked(problem: Any) -> Model:
+    missing = [name for name in _REQUIRED if not hasattr(problem, name)]
     if getattr(problem, "penalty", None) is not None and not hasattr(problem, "penalty_weight"):
         missing.append("penalty_weight (needed with penalty)")
     if missing:
         raise TypeError(
             f"{type(problem).__name__} is not a slipcar.planner.Problem: it lacks {missing}"
         )
-    start = _finite("start", problem.start, (None,))
-    start_covariance = _start_covariance(problem, len(start))
-    times = _finite("times", problem.times, (None,))
-    if len(times) < 2 or not (np.diff(times) > 0).all():
-        raise ValueError(f"times must be at least 2 increasing nodes, not {times!r}")
-    R = _finite("control_weight", problem.control_weight, (None, None))
-    if R.shape[0] != R.shape[1] or not np.allclose(R, R.T) or np.linalg.eigvalsh(R)[0] <= 0:
-        raise ValueError(f"control_weight must be symmetric positive definite, not {R!r}")
+    start = finite("start", problem.start, (None,))
+    times = numbers.node_times(problem.times)
+    R = numbers.control_weight(problem.control_weight)
     lower, upper = control_limits(getattr(problem, "control_bounds", None), len(R))
-    radius = control_ball(getattr(problem, "control_radius", None), lower, upper)
-    n, m = len(start), len(R)
-
-    t2, x2, u2 = times[:2], np.stack([start, start]), np.zeros((2, m))
-    _finite("drift(t, x, u) at the start", problem.drift(t2, x2, u2), (2, n))
-    d = _finite("diffusion(t, x) at the start", problem.diffusion(t2, x2), (2, n, None)).shape[2]
-    q = _finite("terminal(x) at the start", problem.terminal(x2), (2, None)).shape[1]
-    penalty = getattr(problem, "penalty", None)
-    if penalty is None:
-        weight = np.zeros(0)
-        penalty = _no_penalty
-        penalty_jacobian: Any = _no_penalty_jacobian
-    else:
-        p = _finite("penalty(t, x) at the start", penalty(t2, x2), (2, None)).shape[1]
-        weight = _finite("penalty_weight", problem.penalty_weight, (p,))  # type: ignore[attr-defined]
-        if (weight < 0).any():
-            raise ValueError(f"penalty_weight must be >= 0, not {weight!r}")
-        penalty_jacobian = getattr(problem, "penalty_jacobian", None)
-        if penalty_jacobian is None:
-            penalty_jacobian = _state_jacobian(penalty)
-        _finite("penalty_jacobian(t, x)", penalty_jacobian(t2, x2), (2, p, n))
-
-    drift_jacobian = getattr(problem, "drift_jacobian", None) or _drift_jacobian(problem.drift)
-    A, B = drift_jacobian(t2, x2, u2)
-    _finite("drift_jacobian(t, x, u)[0]", A, (2, n, n))
-    _finite("drift_jacobian(t, x, u)[1]", B, (2, n, m))
-    diffusion_jacobian = getattr(problem, "diffusion_jacobian", None)
-    diffusion_jacobian = diffusion_jacobian or _state_jacobian(problem.diffusion)
-    _finite("diffusion_jacobian(t, x)", diffusion_jacobian(t2, x2), (2, n, d, n))
-    terminal_jacobian = getattr(problem, "terminal_jacobian", None)
-    if terminal_jacobian is None:
-
-        def terminal_jacobian(x: Array) -> Array:
-            return complex_step_jacobian(problem.terminal, x)
-
-    _finite("terminal_jacobian(x)", terminal_jacobian(x2), (2, q, n))
-    return Model(
+    model = Model(
         problem=problem,
         start=start,
-        start_covariance=start_covariance,
+        start_covariance=numbers.start_covariance(
+            getattr(problem, "start_covariance", None), len(start)
+        ),
         times=times,
         dt=np.diff(times),
         R=R,
         lower=lower,
         upper=upper,
-        radius=radius,
-        weight=weight,
-        drift=problem.drift,
-        drift_jacobian=drift_jacobian,
-        diffusion=problem.diffusion,
-        diffusion_jacobian=diffusion_jacobian,
-        penalty=penalty,
-        penalty_jacobian=penalty_jacobian,
-        terminal=problem.terminal,
-        terminal_jacobian=terminal_jacobian,
-        **_running_costs(problem, t2, x2, m),
+        radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
+        weight=np.zeros(0),
     )
+    return dataclasses.replace(model, weight=_checked_functions(model))
 
 
-def _start_covariance(problem: Problem, n: int) -> Array:
-    """Σ_0, checked, (n, n); zero where the problem has none."""
-    given = getattr(problem, "start_covariance", None)
-    if given is None:
-        return np.zeros((n, n))
-    S = _finite("start_covariance", given, (n, n))
-    largest = float(np.abs(S).max(initial=0.0))
-    bent = np.argwhere(np.abs(S - S.T) > 1e-9 * largest)
-    if len(bent):
-        i, j = (int(index) for index in bent[0])
-        raise ValueError(
-            f"start_covariance must be symmetric, but [{i}, {j}] is {S[i, j]:.6g} and "
-            f"[{j}, {i}] is {S[j, i]:.6g}"
-        )
-    S = 0.5 * (S + S.T)
-    least = float(np.linalg.eigvalsh(S)[0])
-    if least < -1e-9 * largest:
-        raise ValueError(
-            f"start_covariance must be positive semidefinite, but has the eigenvalue {least:.3g}"
-        )
-    return S
+def _checked_functions(model: Model) -> Array:
+    """Look at every function at the start; the penalties' weights, (p,)."""
+    problem: Any = model.problem
+    n, m = model.state_dim, model.control_dim
+    t2, x2, u2 = model.times[:2], np.stack([model.start, model.start]), np.zeros((2, m))
+    for argument in (t2, x2, u2):
+        argument.setflags(write=False)
+    at_start = functools.partial(_answer, problem)
+    at_start("drift", (2, n), t2, x2, u2)
+    d = at_start("diffusion", (2, n, None), t2, x2).shape[2]
+    q = at_start("terminal", (2, None), x2).shape[1]
+    weight = np.zeros(0)
+    if model.has("penalty"):
+        p = at_start("penalty", (2, None), t2, x2).shape[1]
+        weight = finite("penalty_weight", problem.penalty_weight, (p,))
+        if (weight < 0).any():
+            raise ValueError(f"penalty_weight must be >= 0, not {weight!r}")
+        if model.has("penalty_jacobian"):
+            at_start("penalty_jacobian", (2, p, n), t2, x2)
+    if model.has("drift_jacobian"):
+        A, B = problem.drift_jacobian(t2, x2, u2)
+        finite("drift_jacobian(t, x, u)[0]", A, (2, n, n))
+        finite("drift_jacobian(t, x, u)[1]", B, (2, n, m))
+    if model.has("diffusion_jacobian"):
+        at_start("diffusion_jacobian", (2, n, d, n), t2, x2)
+    if model.has("terminal_jacobian"):
+        at_start("terminal_jacobian", (2, q, n), x2)
+    if model.has("state_cost"):
+        at_start("state_cost", (2,), t2, x2)
+        if model.has("state_cost_derivatives"):
+            gradient, hessian = problem.state_cost_derivatives(t2, x2)
+            finite("state_cost_derivatives(t, x)[0]", gradient, (2, n))
+            finite("state_cost_derivatives(t, x)[1]", hessian, (2, n, n))
+    if model.has("control_cost"):
+        at_start("control_cost", (2, m), t2, x2)
+        if model.has("control_cost_jacobian"):
+            at_start("control_cost_jacobian", (2, m, n), t2, x2)
+    return weight
 
 
-def _running_costs(problem: Problem, t2: Array, x2: Array, m: int) -> dict[str, Any]:
-    """State and control cost with their derivatives, checked at two points (2,), (2, n)."""
-    n = x2.shape[1]
-    H, linear = getattr(problem, "state_cost", None), getattr(problem, "control_cost", None)
-    found: dict[str, Any] = {}
-    if H is not None:
-        _finite("state_cost(t, x) at the start", H(t2, x2), (2,))
-        derivatives = getattr(problem, "state_cost_derivatives", None)
-        if derivatives is None:
-
-            def derivatives(t: Array, x: Array) -> tuple[Array, Array]:
-                return gradient_and_hessian(lambda y: H(t, y), x)
-
-        gradient, hessian = derivatives(t2, x2)
-        _finite("state_cost_derivatives(t, x)[0]", gradient, (2, n))
-        _finite("state_cost_derivatives(t, x)[1]", hessian, (2, n, n))
-        found |= {"state_cost": H, "state_cost_derivatives": derivatives}
-    if linear is not None:
-        _finite("control_cost(t, x) at the start", linear(t2, x2), (2, m))
-        jacobian = getattr(problem, "control_cost_jacobian", None) or _state_jacobian(linear)
-        _finite("control_cost_jacobian(t, x)", jacobian(t2, x2), (2, m, n))
-        found |= {"control_cost": linear, "control_cost_jacobian": jacobian}
-    return found
-
-
-def _finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
+def _answer(problem: Any, name: str, shape: tuple[int | None, ...], *arguments: Array) -> Array:
+    """A function's answer at two points, checked; its arguments cannot be written to."""
+    signature = {1: "x", 2: "t, x", 3: "t, x, u"}[len(arguments)]
+    label = f"{name}({signature})"
     try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers, not {value!r}") from error
-    if array.ndim != len(shape) or any(
-        want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
-    ):
-        wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
-        raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
-    if not np.isfinite(array).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name}{list(index)} must be finite, not {array[index]}")
-    return array
-
-
-def _no_penalty(t: Array, x: Array) -> Array:
-    return np.zeros((*x.shape[:-1], 0))
-
-
-def _no_penalty_jacobian(t: Array, x: Array) -> Array:
-    return np.zeros((*x.shape[:-1], 0, x.shape[-1]))
-
-
-def _state_jacobian(f: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Array]:
-    def jacobian(t: Array, x: Array) -> Array:
-        return complex_step_jacobian(lambda y: f(t, y), x)
-
-    return jacobian
-
-
-def _drift_jacobian(
-    drift: Callable[[Array, Array, Array], Array],
-) -> Callable[[Array, Array, Array], tuple[Array, Array]]:
-    def jacobian(t: Array, x: Array, u: Array) -> tuple[Array, Array]:
-        A = complex_step_jacobian(lambda y: drift(t, y, u), x)
-        B = complex_step_jacobian(lambda v: drift(t, x, v), u)
-        return A, B
-
-    return jacobian
+        value = getattr(problem, name)(*arguments)
+    except ValueError as error:
+        if "read-only" in str(error):
+            raise ValueError(
+                f"{label} wrote into its argument ({error}): copy it first, x = x.copy()"
+            ) from error
+        raise
+    label += "" if name.endswith("_jacobian") else " at the start"
+    return finite(label, value, shape)

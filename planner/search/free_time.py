@@ -24,11 +24,12 @@ import numpy as np
 
 from slipcar.planner.extremal.maximum_principle import first_order, time_slope
 from slipcar.planner.history import Iteration
+from slipcar.planner.newton.posing import Posed
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import TimeStep
-from slipcar.planner.search.method import solve
+from slipcar.planner.search.attempt import attempt
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -82,6 +83,7 @@ def checked_bounds(model: Model, given: Any) -> tuple[float, float]:
 
 def free_final_time(
     model: Model,
+    posed: Posed | None,
     options: Options,
     found: Outcome,
     *,
@@ -92,6 +94,7 @@ def free_final_time(
 
     Args:
         model: the problem; its horizon is the first that was tried.
+        posed: the same for Newton's method, or None.
         options: of the iteration.
         found: the plan there.
         time_weight: c, cost per second.
@@ -103,7 +106,7 @@ def free_final_time(
     """
     if found.status is Status.STOPPED:
         return model, found, ()
-    model, best, steps, settled = _search(model, options, found, time_weight, bounds)
+    model, best, steps, settled = _search(model, posed, options, found, time_weight, bounds)
     # Horizons that were not taken are told of in `steps` alone.
     history = tuple(row for step, rows in steps if step.accepted for row in rows)
     tried = sum(step.iterations for step, _ in steps)
@@ -124,6 +127,7 @@ def free_final_time(
 
 def _search(
     model: Model,
+    posed: Posed | None,
     options: Options,
     found: Outcome,
     time_weight: float,
@@ -135,7 +139,7 @@ def _search(
 
     def at(T: float, x: Array, u: Array) -> _Point:
         there = dilated(model, T)
-        outcome = solve(there, precise, x, model.admissible(u), free_first=False)
+        outcome = attempt(there, posed, precise, x, model.admissible(u), free_first=False)
         slope, objective = np.nan, np.inf
         if outcome.status.ok:
             first = first_order(there, outcome.x, outcome.u, variance_weight)

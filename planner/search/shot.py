@@ -8,10 +8,11 @@ import numpy as np
 
 from slipcar.planner.extremal.shooting import START_WITHIN, Shot, retry_within, shoot
 from slipcar.planner.history import Iteration
+from slipcar.planner.newton.posing import Posed
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model
-from slipcar.planner.search.method import solve
+from slipcar.planner.search.attempt import attempt
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -21,9 +22,9 @@ _ATTEMPTS = 4
 
 
 def solve_shooting(
-    model: Model, options: Options, x: Array, u: Array, *, free_first: bool
+    model: Model, posed: Posed | None, options: Options, x: Array, u: Array, *, free_first: bool
 ) -> tuple[Outcome, Shot | None]:
-    """`method.solve`, cut short by the first shot that converges.
+    """`attempt`, cut short by the first shot that converges.
 
     Returns:
         The outcome, and the last shot; None if no iterate came near enough to try.
@@ -31,7 +32,7 @@ def solve_shooting(
     limit, attempts = START_WITHIN, 0
     last: Shot | None = None
 
-    def attempt(iteration: Iteration) -> bool | None:
+    def shooting(iteration: Iteration) -> bool | None:
         nonlocal limit, attempts, last
         stop = options.callback is not None and options.callback(iteration)
         if stop or not iteration.accepted or attempts == _ATTEMPTS:
@@ -50,8 +51,8 @@ def solve_shooting(
         limit = retry_within(shot, limit)
         return shot.converged
 
-    found = solve(
-        model, dataclasses.replace(options, callback=attempt), x, u, free_first=free_first
+    found = attempt(
+        model, posed, dataclasses.replace(options, callback=shooting), x, u, free_first=free_first
     )
     if last is None or not last.converged:
         return found, last

@@ -16,11 +16,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from slipcar.planner.batch import Task, solve_tasks
+from slipcar.planner.newton.posing import Posed
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model, checked_trajectory
 from slipcar.planner.records import Alternative
+from slipcar.planner.search.tasks import Task, solve_tasks
 
 Array = np.ndarray
 
@@ -93,10 +94,10 @@ class Starts:
     alternatives: tuple[Alternative, ...]
 
 
-def multistart(model: Model, options: Options, count: int) -> Starts:
+def multistart(model: Model, posed: Posed | None, options: Options, count: int) -> Starts:
     """Plan from several guesses, all at once where that is possible."""
     guesses = initial_guesses(model, count)
-    tasks = [Task(model, guess.states, guess.controls, guess.free_first) for guess in guesses]
+    tasks = [Task(model, posed, g.states, g.controls, g.free_first) for g in guesses]
     # One thread: several would not pay for a handful of problems.
     outcomes = solve_tasks(tasks, options, workers=1, label="guess {}")
     order = sorted(range(len(guesses)), key=lambda i: _rank(outcomes[i]))

@@ -2,7 +2,7 @@
 
     minimise  E[ Σ dt (uᵀRu + H + Σ w max(0, c)²) + gᵀWg ] + w ∫ tr Σ dt,   P(constraint) ≤ δ
 
-for Gaussian states (:mod:`.expected`). The chance constraint is priced: ν times Boole's
+for Gaussian states (:mod:`slipcar.planner.newton.loop`). The chance constraint is priced: ν times Boole's
 bound joins the cost, which allocates the risk over nodes and rows, and ν is searched for until
 simulated paths keep δ (:mod:`.price_search`, :mod:`.monte_carlo`).
 """
@@ -16,18 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.expected.guarded import Posed, posed
-from slipcar.planner.expected.loop import Steered
 from slipcar.planner.moments.gains import wrap
 from slipcar.planner.moments.monte_carlo import violations
 from slipcar.planner.moments.stakes import Stakes
+from slipcar.planner.newton.running import Steered
 from slipcar.planner.options import Options, check_count, check_number
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.control_set import project_controls
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import ExpectedCost
-from slipcar.planner.search.field import Field, expected_cost, priced
-from slipcar.planner.search.price_search import search_price
+from slipcar.planner.search.field import Field
+from slipcar.planner.search.price_search import PriceSearch, search_price
 from slipcar.planner.search.risk import PricedRate, Risk, check_risk, wilson_interval
 from slipcar.planner.status import Status
 
@@ -52,15 +51,28 @@ _FIRST, _DEAREST = 0.02, 1e5
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is asked for beyond the mean; see `slipcar.planner.plan`.
+    """What is asked for beyond the mean.
 
     Attributes:
-        risk: δ, or None.
-        price: ν ≥ 0, where no risk is asked for.
-        feedback: whether gains are part of the plan.
-        expected: whether penalties are to be charged in expectation (they are with any other).
-        terminal_weight: W, scalar or (q,), or None for the problem's own.
-        episodes: paths for the verification.
+        risk: δ in (0, 1): the probability that a path violates `problem.constraint` at any node
+            must not exceed it. The constraint is priced and the price searched for by Monte Carlo
+            on common random numbers; `Plan.risk` holds what was predicted and what fresh paths
+            say. Where no price leads there: status RISK_UNREACHABLE, with the plan of least risk.
+        price: ν ≥ 0 (`risk_price` of `plan`): add ν Σ P(violation) over nodes and constraints to
+            the expected cost (Boole's bound; optimal risk allocation). No Monte Carlo:
+            milliseconds.
+        feedback: plan u = ū + K (x − μ) with the gains that minimise the expected cost: effort
+            of the corrections included, bounds kept at a standard deviation of them.
+            `Feedback(plan)` plays it.
+        expected: charge the penalties' expectation, E Σ w max(0, c)² for Gaussian states, instead
+            of their value at the mean. With any of the above it always is.
+        terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0.
+            None: exact, or with `feedback` the problem's `terminal_weight`, if it has one; if not,
+            exact for the mean, and the spread charged 100 tr Cov g.
+        episodes: fresh paths that verify a risk, ≥ 100 (`risk_episodes`).
+
+    Raises:
+        ValueError: for a value out of range, naming it.
     """
 
     risk: float | None = None
@@ -112,20 +124,25 @@ class Request:
                 f"{type(model.problem).__name__} has none"
             )
 
-    def stakes(self, ready: Posed, q: int, w: float) -> Stakes:
-        """What to charge at price zero.
+    def stakes(self, model: Model, w: float) -> Stakes:
+        """What to charge, constraints at price zero.
 
         Raises:
             ValueError: for a terminal weight of wrong shape or sign.
         """
-        guarded = ready.guarded
+        problem: Any = model.problem
+        q = np.shape(model.terminal(model.start))[-1]
         given = self.terminal_weight
         if given is None and self.feedback:
-            given = getattr(guarded.problem, "terminal_weight", None)
+            given = getattr(problem, "terminal_weight", None)
         spread = _SPREAD_WEIGHT if self.feedback else 0.0
+        constraints = 0
+        if model.has("constraint"):
+            constraints = np.shape(problem.constraint(model.times[:1], model.start[None]))[-1]
         return Stakes(
-            weight=guarded.penalty_weight,
-            tail=guarded.is_constraint,
+            penalties=model.weight,
+            constraints=constraints,
+            price=0.0,
             terminal=np.full(q, spread) if given is None else _checked_terminal(given, q),
             soft=given is not None,
             feedback=self.feedback,
@@ -138,7 +155,7 @@ class Steering:
     """What came of a request.
 
     Attributes:
-        found: where the iteration ended.
+        plan: where the iteration ended.
         status: how planning ended.
         cost: what is expected of the plan.
         risk: where one was asked for.
@@ -147,7 +164,7 @@ class Steering:
         iterations: Newton steps in all.
     """
 
-    found: Steered
+    plan: Steered
     status: Status
     cost: ExpectedCost
     risk: Risk | None
@@ -157,129 +174,140 @@ class Steering:
 
 
 def steer(
-    problem: Any, options: Options, request: Request, candidates: Sequence[Outcome]
+    model: Model, options: Options, request: Request, candidates: Sequence[Outcome]
 ) -> Steering:
     """Go on from plans of the mean, the best first; which is taken is decided by expected cost."""
-    ready = posed(problem, options.integrator)
-    first = candidates[0]
-    q = len(np.asarray(ready.model.terminal(first.x[-1])))
-    stakes = request.stakes(ready, q, options.variance_weight)
-    field = Field(ready, options, stakes, [(c.x, c.u) for c in candidates])
-    if request.risk is None:
-        price = request.price or 0.0
-        found = field.solve(price) or field.attempt
-        cost = expected_cost(ready.model, priced(stakes, price), found)
-        say = "" if found.status.ok else "the iteration on the expected cost did not settle"
-        return Steering(found, found.status, cost, None, say, field.origin(found), field.steps)
-    return _calibrated(problem, request, ready, field, stakes)
+    stakes = request.stakes(model, options.variance_weight)
+    field = Field(model, options, stakes, [(c.x, c.u) for c in candidates])
+    if request.risk is not None:
+        return _Calibration(request, model, field).run()
+    plan = field.solve(request.price or 0.0) or field.attempt
+    say = "" if plan.status.ok else "the iteration on the expected cost did not settle"
+    return Steering(plan, plan.status, field.cost(plan), None, say, field.origin(plan), field.steps)
 
 
-def _predicted(model: Model, stakes: Stakes, trial: Any) -> float | None:
-    if trial.answer is None:
-        return None
-    return expected_cost(model, priced(stakes, trial.price), trial.answer).risk
-
-
-def law(model: Model, found: Steered) -> Any:
+def law(model: Model, plan: Steered) -> Any:
     """The law u = ū + K (x − μ) within bounds, as a function (t, x (..., n)) -> (..., m)."""
     angles = tuple(getattr(model.problem, "angles", ()))
-    closed = bool(found.gains.any())
+    closed = bool(plan.gains.any())
     starts = model.times[:-1]
 
     def control(t: Any, x: Array) -> Array:
         k = int(np.argmin(np.abs(starts - t)))
         if not closed:
-            return np.broadcast_to(found.u[k], (*np.shape(x)[:-1], found.u.shape[1]))
-        u = found.u[k] + wrap(x - found.x[k], angles) @ found.gains[k].T
+            return np.broadcast_to(plan.u[k], (*np.shape(x)[:-1], plan.u.shape[1]))
+        u = plan.u[k] + wrap(x - plan.x[k], angles) @ plan.gains[k].T
         return project_controls(u, model.lower, model.upper, model.radius)
 
     return control
 
 
-def _calibrated(
-    problem: Any, request: Request, ready: Posed, field: Field, stakes: Stakes
-) -> Steering:
-    """The price at which the risk is kept, the plan at that price, and the proof."""
-    model, delta = ready.model, float(request.risk or 0.0)
-    paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
-    noise = np.sqrt(delta * (1.0 - delta) * (1.0 / paths + 1.0 / request.episodes))
-    target = max(delta - _CAUTION * float(noise), 0.3 * delta)
-    countable = delta * paths >= _COUNTABLE
-    if not countable:
-        target = delta
-    simulated = 0.0
+class _Calibration:
+    """The search for the price at which a risk is kept, the plan at that price, and the proof.
 
-    def rate(found: Steered, episodes: int, seed: int) -> float:
-        nonlocal simulated
+    Args:
+        request: with a risk δ.
+        model: the problem.
+        field: candidates.
+    """
+
+    def __init__(self, request: Request, model: Model, field: Field) -> None:
+        self._request, self._model, self._field = request, model, field
+        delta = self._delta = float(request.risk or 0.0)
+        paths = self._paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
+        noise = np.sqrt(delta * (1.0 - delta) * (1.0 / paths + 1.0 / request.episodes))
+        self._countable = delta * paths >= _COUNTABLE
+        self._target = max(delta - _CAUTION * float(noise), 0.3 * delta)
+        if not self._countable:
+            self._target = delta
+        self._simulated = 0.0
+        self._tried: list[PricedRate] = []
+
+    def run(self) -> Steering:
+        """Search."""
+        free = self._field.solve(0.0)
+        verified = None if free is None else self._safe_already(free)
+        if free is not None and verified is not None:
+            return self._answer(free, 0.0, verified, kept=True)
+        delta, target = self._delta, self._target
+        price = _FIRST * max(abs(self._field.attempt.effort), 1e-6) / delta
+        for attempt in range(_VERIFICATIONS):
+            search = self._search(target, price)
+            plan = search.best
+            if plan is None:
+                last = self._field.attempt
+                say = f"no plan was found at any price of risk: the last ended {last.status}"
+                cost, status = self._field.cost(last), Status.SOLVER_FAILED
+                return Steering(last, status, cost, None, say, 0, self._field.steps)
+            verified = self._rate(plan, self._request.episodes, _VERIFICATION_SEED + attempt)
+            if verified <= delta or not search.reached:
+                break
+            # Fresh paths disagree with those of the search: ask for less.
+            target, price = target * 0.9 * delta / verified, search.price
+        kept = bool(search.reached and verified <= delta)
+        return self._answer(plan, search.price, verified, kept)
+
+    def _safe_already(self, free: Steered) -> float | None:
+        """The verified rate of the plan without a price, if it keeps the risk; else None."""
+        predicted = self._field.predicted_risk(free)
+        # Boole's bound says whether to look.
+        if predicted > _BOOLE * self._delta:
+            return None
+        rate = self._measure(free)
+        self._tried.append(PricedRate(0.0, predicted, rate))
+        if rate > self._target:
+            return None
+        verified = self._rate(free, self._request.episodes, _VERIFICATION_SEED)
+        return verified if verified <= self._delta else None
+
+    def _search(self, target: float, price: float) -> PriceSearch:
+        search = search_price(
+            lambda price, _: self._field.solve(price),
+            self._measure,
+            target=target,
+            first=price,
+            largest=_DEAREST * price,
+            resolution=1.0 / self._paths if self._countable else 0.0,
+        )
+        for trial in search.tried:
+            predicted = trial.answer and self._field.predicted_risk(trial.answer)
+            self._tried.append(PricedRate(trial.price, predicted, trial.rate))
+        return search
+
+    def _measure(self, plan: Steered) -> float:
+        if self._countable:
+            return self._rate(plan, self._paths, _SEARCH_SEED)
+        return self._field.predicted_risk(plan)
+
+    def _rate(self, plan: Steered, episodes: int, seed: int) -> float:
         began = time.perf_counter()
-        broken = violations(problem, law(model, found), episodes=episodes, seed=seed)
-        simulated += time.perf_counter() - began
+        broken = violations(
+            self._model.problem, law(self._model, plan), episodes=episodes, seed=seed
+        )
+        self._simulated += time.perf_counter() - began
         return float(broken.mean())
 
-    def measure(found: Steered) -> float:
-        if countable:
-            return rate(found, paths, _SEARCH_SEED)
-        return expected_cost(model, stakes, found).risk
-
-    def answer(found: Steered, price: float, kept: bool) -> Steering:
-        cost = expected_cost(model, priced(stakes, price), found)
+    def _answer(self, plan: Steered, price: float, verified: float, kept: bool) -> Steering:
+        delta, episodes, field = self._delta, self._request.episodes, self._field
+        cost = field.cost(plan)
         risk = Risk(
             requested=delta,
             predicted=cost.risk,
             verified=verified,
-            interval=wilson_interval(round(verified * request.episodes), request.episodes),
-            episodes=request.episodes,
+            interval=wilson_interval(round(verified * episodes), episodes),
+            episodes=episodes,
             price=price,
             reached=kept,
-            tried=tuple(tried),
-            simulation_time=simulated,
+            tried=tuple(self._tried),
+            simulation_time=self._simulated,
         )
-        if kept:
-            say = ""
-            if not countable:
-                say = f"{paths:,} paths cannot tell a risk of {delta:g}: Boole's bound keeps it"
-            return Steering(found, found.status, cost, risk, say, field.origin(found), field.steps)
-        say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
-        status = Status.RISK_UNREACHABLE
-        return Steering(found, status, cost, risk, say, field.origin(found), field.steps)
-
-    tried: list[PricedRate] = []
-    free = field.solve(0.0)
-    if free is not None:
-        # Perhaps what is cheapest is safe enough: Boole's bound says whether to look.
-        cost = expected_cost(model, stakes, free)
-        if cost.risk <= _BOOLE * delta:
-            share = measure(free)
-            tried.append(PricedRate(0.0, cost.risk, share))
-            if share <= target:
-                verified = rate(free, request.episodes, _VERIFICATION_SEED)
-                if verified <= delta:
-                    return answer(free, 0.0, True)
-    scale = max(abs(field.attempt.effort), 1e-6)
-    first = _FIRST * scale / delta
-    for attempt in range(_VERIFICATIONS):
-        search = search_price(
-            lambda price, _: field.solve(price),
-            measure,
-            target=target,
-            first=first,
-            largest=_DEAREST * first,
-            resolution=1.0 / paths if countable else 0.0,
-        )
-        tried += [PricedRate(t.price, _predicted(model, stakes, t), t.rate) for t in search.tried]
-        found = search.best
-        if found is None:
-            cost = expected_cost(model, stakes, field.attempt)
-            say = f"no plan was found at any price of risk: the last ended {field.attempt.status}"
-            status = Status.SOLVER_FAILED
-            return Steering(field.attempt, status, cost, None, say, 0, field.steps)
-        verified = rate(found, request.episodes, _VERIFICATION_SEED + attempt)
-        if verified <= delta or not search.reached:
-            break
-        # Fresh paths disagree with those of the search: ask for less.
-        target, first = target * 0.9 * delta / verified, search.price
-    assert found is not None
-    return answer(found, search.price, bool(search.reached and verified <= delta))
+        status, say = plan.status, ""
+        if not kept:
+            status = Status.RISK_UNREACHABLE
+            say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
+        elif not self._countable:
+            say = f"{self._paths:,} paths cannot tell a risk of {delta:g}: Boole's bound keeps it"
+        return Steering(plan, status, cost, risk, say, field.origin(plan), field.steps)
 
 
 def _numbers(given: Any) -> Array:

@@ -11,7 +11,7 @@ own guess would: unless it can be trusted, both are tried (:func:`run_guarded`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from slipcar.planner.problem.feasibility import inconsistency
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model, checked_trajectory
 from slipcar.planner.status import Status
-
-if TYPE_CHECKING:
-    from slipcar.planner.plan import Plan
 
 Array = np.ndarray
 
@@ -42,7 +39,7 @@ def given_guess(model: Model, guess: Any) -> tuple[Array, Array]:
     return checked_trajectory(model, *guess)
 
 
-def _resampled(model: Model, plan: Plan) -> tuple[Array, Array]:
+def _resampled(model: Model, plan: Any) -> tuple[Array, Array]:
     old, new = plan.times, model.times
     n, m = plan.mean.shape[1], plan.controls.shape[1]
     if (n, m) != (model.state_dim, model.control_dim):

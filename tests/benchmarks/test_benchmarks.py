@@ -10,7 +10,7 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import plan
-from slipcar.planner.convex.solvers import make_solver
+from slipcar.planner.convex.solvers.registry import make_solver
 
 pytest.importorskip("casadi", reason='casadi is not installed: pip install "slipcar[bench]"')
 pytest.importorskip("rich")

@@ -6,15 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipcar.evaluation.report.document import (
-    Column,
-    Document,
-    Figure,
-    Table,
-    from_json,
-    read_document,
-    table_of,
-)
+from slipcar.evaluation.report.document import Document, Figure, from_json, read_document
+from slipcar.evaluation.report.table import Column, Table, table_of
 
 
 @pytest.fixture

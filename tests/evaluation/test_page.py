@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipcar.evaluation.report.document import Document, Figure, Table
+from slipcar.evaluation.report.document import Document, Figure
 from slipcar.evaluation.report.page import Section, html
+from slipcar.evaluation.report.table import Table
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)

@@ -13,7 +13,8 @@ import pytest
 from slipcar.evaluation.cli import main
 from slipcar.evaluation.commands.report import report
 from slipcar.evaluation.report import folder as report_folder
-from slipcar.evaluation.report.document import Document, Figure, Table
+from slipcar.evaluation.report.document import Document, Figure
+from slipcar.evaluation.report.table import Table
 
 
 def result(kind, title, **frames):

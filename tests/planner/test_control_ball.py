@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from slipcar.envs import Scenario
 from slipcar.planner import Feedback, Status, plan
-from slipcar.planner.convex import solvers as backends
+from slipcar.planner.convex.solvers.registry import make_solver
 from slipcar.planner.convex.solvers.structured import StructuredSolver
 from slipcar.planner.problem.control_set import project_controls
 
@@ -51,17 +51,12 @@ class Drifter:
         return x - self.goal
 
 
-STRUCTURED = {"numba": None, "numpy": False}
-
-
-@pytest.mark.parametrize("compiled", STRUCTURED.values(), ids=STRUCTURED)
-def test_a_goal_that_is_just_out_of_reach(compiled):
+def test_a_goal_that_is_just_out_of_reach():
     T, direction = UNEVEN[-1], np.array([0.6, 0.8])
-    solver = lambda: StructuredSolver(compiled=compiled)  # noqa: E731
-    p = plan(Drifter(1.0, 0.999 * T * direction), solver=solver())
+    p = plan(Drifter(1.0, 0.999 * T * direction), solver=StructuredSolver())
     assert p.status is Status.CONVERGED
     np.testing.assert_allclose(p.controls, np.tile(0.999 * direction, (24, 1)), rtol=1e-7)
-    q = plan(Drifter(1.0, 1.2 * T * direction), solver=solver())
+    q = plan(Drifter(1.0, 1.2 * T * direction), solver=StructuredSolver())
     assert q.status is Status.INFEASIBLE
     # As far as it gets: full thrust (an exact 1-norm penalty may choose another direction).
     np.testing.assert_allclose(np.linalg.norm(q.controls, axis=1), 1.0, rtol=1e-9)
@@ -121,11 +116,10 @@ def met():
 
 
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
-@pytest.mark.parametrize("compiled", STRUCTURED.values(), ids=STRUCTURED)
 @pytest.mark.parametrize("name", [*PROBLEMS, "paper"])
-def test_the_structured_solver_agrees_with_a_cone_solver(met, name, compiled):
+def test_the_structured_solver_agrees_with_a_cone_solver(met, name):
     pytest.importorskip("cvxpy")
-    oracle, solver = backends.make_solver("cvxpy"), StructuredSolver(compiled=compiled)
+    oracle, solver = make_solver("cvxpy"), StructuredSolver()
     for sub in met[name]:
         known, found = oracle.solve(sub), solver.solve(sub)
         assert found.found
@@ -140,12 +134,11 @@ def test_the_structured_solver_agrees_with_a_cone_solver(met, name, compiled):
         assert np.max(np.abs(found.adjoint - known.adjoint)) < 2e-4 * price
 
 
-@pytest.mark.parametrize("compiled", STRUCTURED.values(), ids=STRUCTURED)
 @pytest.mark.parametrize("name", ["tight", "windy", "with a box", "paper"])
-def test_controls_minimise_the_hamiltonian_over_the_ball(met, name, compiled):
+def test_controls_minimise_the_hamiltonian_over_the_ball(met, name):
     # u minimises slope·v over U to first order: u is the projection of u − slope onto U.
     for sub in met[name]:
-        s = StructuredSolver(compiled=compiled).solve(sub)
+        s = StructuredSolver().solve(sub)
         slope = np.einsum("kij,kj->ki", sub.R, s.e) + sub.r
         slope += np.einsum("kni,kn->ki", sub.B, s.adjoint)
         u = s.e - sub.center

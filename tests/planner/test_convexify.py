@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
-from slipcar.planner.convex.convexify import convexify
+from slipcar.planner.convex.subproblem import convexify
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import model_of
 

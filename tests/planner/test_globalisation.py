@@ -6,13 +6,13 @@ import pytest
 from slipcar.envs import Scenario
 from slipcar.planner import Status
 from slipcar.planner.convex.acceleration import Acceleration
-from slipcar.planner.convex.scp import iterate
+from slipcar.planner.convex.iteration import iterate
 from slipcar.planner.convex.solvers.structured import StructuredSolver
 from slipcar.planner.convex.trust_region import (
     AdaptiveTrustRegion,
-    NoTrustRegion,
     PaperTrustRegion,
     Step,
+    TrustRegion,
 )
 from slipcar.planner.options import Options
 from slipcar.planner.problem.model import model_of
@@ -90,13 +90,13 @@ def test_early_steps_pass_the_bounds_and_the_last_ones_do_not():
     beyond = [np.any(np.abs(h.controls) > scenario.control_bounds * 1.001) for h in found.history]
     assert beyond[0]
     assert not beyond[-1]
-    within = exact_subproblems(scenario, trust=NoTrustRegion())
+    within = exact_subproblems(scenario, trust=TrustRegion())
     assert not any(
         np.any(np.abs(h.controls) > scenario.control_bounds * 1.001) for h in within.history
     )
 
 
-@pytest.mark.parametrize("schedule", [PaperTrustRegion, NoTrustRegion])
+@pytest.mark.parametrize("schedule", [PaperTrustRegion, TrustRegion])
 def test_the_plain_schedules_stay_plain(schedule):
     found = exact_subproblems(Scenario.named("paper"), trust=schedule(), tolerance=1e-9)
     # Each step is the sub-problem's own: the controls differ by what `step` says.
@@ -180,7 +180,7 @@ def test_accelerated_steps_reach_the_same_optimum(paper):
     scenario = Scenario.random(249, turned=True)
     fast = exact_subproblems(scenario, tolerance=1e-10, max_iterations=200)
     assert fast.status is Status.CONVERGED
-    plain = exact_subproblems(scenario, trust=NoTrustRegion(), tolerance=1e-10, max_iterations=2000)
+    plain = exact_subproblems(scenario, trust=TrustRegion(), tolerance=1e-10, max_iterations=2000)
     if plain.status is Status.CONVERGED:
         assert len(fast.history) < 0.5 * len(plain.history)
     assert fast.objective <= plain.objective + 1e-6 or fast.objective < 1.02 * plain.objective

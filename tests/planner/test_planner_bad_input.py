@@ -8,7 +8,7 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Problem, Status, plan
-from slipcar.planner.convex.solvers import make_solver
+from slipcar.planner.convex.solvers.registry import make_solver
 
 
 class Cart:

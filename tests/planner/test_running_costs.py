@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import minimize
 
 from slipcar.planner import Plan, Status, plan
-from slipcar.planner.convex.solvers.structured import StructuredSolver
 from slipcar.planner.problem.derivatives import gradient_and_hessian
 from slipcar.planner.problem.linearization import linearize, nearest_semidefinite
 from slipcar.planner.problem.model import model_of
@@ -251,14 +250,6 @@ def test_a_tracking_penalty_written_either_way():
     b = plan(Cart(state_cost=lambda t, x: 5.0 * (x[..., 0] - np.sin(t)) ** 2), tolerance=1e-10)
     np.testing.assert_allclose(a.controls, b.controls, atol=1e-6)
     assert a.obstacle_cost == pytest.approx(b.running_cost, rel=1e-7)
-
-
-def test_python_and_compiled_kernels_agree():
-    pytest.importorskip("numba")
-    a, b = (
-        plan(Swing(), solver=StructuredSolver(compiled=c), tolerance=1e-8) for c in (True, False)
-    )
-    np.testing.assert_allclose(a.controls, b.controls, atol=1e-7)
 
 
 def test_running_costs_are_kept_in_the_file(tmp_path):

@@ -5,8 +5,9 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.extremal.certificate import certify, model_for
+from slipcar.planner.extremal.certificate import certify
 from slipcar.planner.extremal.maximum_principle import first_order
+from slipcar.planner.extremal.planned import model_for
 from slipcar.planner.extremal.second_order import second_order
 from slipcar.planner.extremal.shooting import (
     START_WITHIN,

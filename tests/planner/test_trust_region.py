@@ -8,9 +8,9 @@ from slipcar.planner import Status, plan
 from slipcar.planner.convex import trust_region
 from slipcar.planner.convex.trust_region import (
     AdaptiveTrustRegion,
-    NoTrustRegion,
     PaperTrustRegion,
     Step,
+    TrustRegion,
 )
 
 
@@ -91,7 +91,7 @@ def test_radius_counts_the_noise_of_the_error_process(monkeypatch):
 
 
 def test_no_trust_region_takes_everything_that_is_finite():
-    t = NoTrustRegion()
+    t = TrustRegion()
     assert t.fits(1e300)
     assert t.judge(step(actual=-1e300))
     assert not t.collapsed

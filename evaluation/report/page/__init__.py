@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from slipcar.evaluation.report import text as report_text
-from slipcar.evaluation.report.document import Document, Figure, Table, plain
+from slipcar.evaluation.report.document import Document, Figure, plain
+from slipcar.evaluation.report.table import Table
 
 __all__ = ["Section", "html"]
 

@@ -17,16 +17,17 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.convex.convexify import Subproblem
+from slipcar.planner.convex.solvers.lq_problem import Ray
+from slipcar.planner.convex.subproblem import Subproblem
 
 Array = np.ndarray
 
 #: κ per unit of the control weight; and how far directions may still turn, and controls pass
 #: the sphere (relative), when Newton's method has settled.
-STIFFNESS, SETTLED = 1e5, 1e-9
+_STIFFNESS, _SETTLED = 1e5, 1e-9
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Spheres:
     """At which intervals the control is held on the sphere.
 
@@ -42,25 +43,25 @@ class Spheres:
     press: Array
     slack: float
 
-    def __eq__(self, other: object) -> bool:
+    def same_as(self, other: Spheres) -> bool:
+        """Whether Newton's method has settled between the two."""
         return (
-            isinstance(other, Spheres)
-            and bool((self.on == other.on).all())
-            and float(np.max(np.abs(self.turn - other.turn), initial=0.0)) <= SETTLED
+            bool((self.on == other.on).all())
+            and float(np.max(np.abs(self.turn - other.turn), initial=0.0)) <= _SETTLED
             and float(np.max(np.abs(self.press - other.press), initial=0.0)) <= self.slack
         )
 
 
 def stiffness(sub: Subproblem) -> float:
     """κ of a sub-problem."""
-    return STIFFNESS * float(np.einsum("kii->ki", sub.R).max())
+    return _STIFFNESS * float(sub.R.diagonal(axis1=1, axis2=2).max())
 
 
 def spheres(sub: Subproblem, on: Array, u: Array, press: Array) -> Spheres:
     """Spheres held where `on`, touched in the direction of u (K, m)."""
     size = np.linalg.norm(u, axis=1)
     turn = np.where(on[:, None], u / np.where(on, size, 1.0)[:, None], 0.0)
-    slack = SETTLED * stiffness(sub) * sub.radius
+    slack = _SETTLED * stiffness(sub) * sub.radius
     return Spheres(on, turn, np.where(on, press, 0.0), slack)
 
 
@@ -74,15 +75,15 @@ def start(sub: Subproblem, before: Spheres | None) -> Spheres:
     return spheres(sub, before.on & near, u, before.press)
 
 
-def terms(sub: Subproblem, held: Spheres) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """What they add to R, (K, m, m), and to r, (K, m); and the `ray` of `BandedKkt.solve`."""
-    t, kappa = held.turn, stiffness(sub)
-    across = np.where(held.on[:, None, None], np.eye(t.shape[1]), 0.0)
+def terms(sub: Subproblem, touched: Spheres) -> tuple[Array, Array, Ray]:
+    """What they add to R, (K, m, m), and to r, (K, m); and the stiff ray."""
+    t, press = touched.turn, touched.press
+    across = np.where(touched.on[:, None, None], np.eye(t.shape[1]), 0.0)
     across -= t[:, :, None] * t[:, None, :]
-    block = (held.press / sub.radius)[:, None, None] * across
-    vector = held.press[:, None] * t - np.matmul(block, sub.center[..., None])[..., 0]
+    block = (press / sub.radius)[:, None, None] * across
+    push = press[:, None] * t - np.matmul(block, sub.center[..., None])[..., 0]
     reach = sub.radius + np.sum(t * sub.center, axis=1)
-    return block, vector, (t, kappa * held.on, reach)
+    return block, push, Ray(t, stiffness(sub) * touched.on, reach)
 
 
 def at(sub: Subproblem, e: Array, before: Spheres) -> Spheres:

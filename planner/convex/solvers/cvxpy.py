@@ -6,8 +6,8 @@ import cvxpy as cp
 import numpy as np
 from scipy import linalg, sparse
 
-from slipcar.planner.convex.convexify import Subproblem
-from slipcar.planner.convex.solvers import Solution, failed
+from slipcar.planner.convex.solvers.interface import Solution, failed
+from slipcar.planner.convex.subproblem import Subproblem
 
 #: Solvers tried in order, with the settings that make them precise.
 _SOLVERS = {
@@ -30,12 +30,12 @@ class CvxpySolver:
 
     def __init__(self, solver: str | None = None) -> None:
         installed = cp.installed_solvers()
-        found = solver or next((name for name in _SOLVERS if name in installed), None)
-        if found is None:
+        chosen = solver or next((name for name in _SOLVERS if name in installed), None)
+        if chosen is None:
             raise ImportError(
                 f'cvxpy has none of {list(_SOLVERS)} installed: pip install "slipcar[qp]"'
             )
-        self.solver = found
+        self.solver = chosen
 
     def solve(self, sub: Subproblem) -> Solution:
         """Solve one sub-problem."""

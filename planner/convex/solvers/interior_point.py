@@ -18,11 +18,14 @@ both vanish, which makes the end linear rather than superlinear: the method stop
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from slipcar.planner.convex.convexify import Subproblem
-from slipcar.planner.lq.banded import BandedKkt, Point
+from slipcar.planner.convex.solvers.lq_problem import End, LqProblem, Ray, Terms
+from slipcar.planner.convex.subproblem import Subproblem
+from slipcar.planner.lq.banded import PrimalDual
 
 Array = np.ndarray
 
@@ -32,124 +35,142 @@ _GAP = 1e-9
 _ENOUGH, _IDLE = 1e-6, 8
 
 
-@dataclasses.dataclass
-class _Pairs:
-    """Slacks and multipliers of every inequality.
+class _Pair(NamedTuple):
+    """Slacks s ≥ 0 of inequalities and their multipliers z ≥ 0; or the change of both."""
 
-    Bounds on e are (K, m), hinges (K, p), balls (K,), the rest (q,).
-    """
+    s: Array
+    z: Array
 
-    lower: Array
-    z_lower: Array
-    upper: Array
-    z_upper: Array
-    above: Array  # t − c
-    z_above: Array
-    t: Array
-    z_t: Array
-    plus: Array  # terminal slack s⁺, its multiplier ρ − ν
-    z_plus: Array
-    minus: Array
-    z_minus: Array
-    high: Array  # τ − w
-    z_high: Array
-    low: Array  # τ + w
-    z_low: Array
-    ball: Array  # (K,), or (0,) where there are no balls
-    z_ball: Array
 
-    def couples(self) -> list[tuple[Array, Array]]:
-        f = [getattr(self, field.name) for field in dataclasses.fields(self)]
-        return list(zip(f[::2], f[1::2], strict=True))
+class _Pairs(NamedTuple):
+    """Those of every inequality; infinite slacks with z = 0 where there is none."""
+
+    lower: _Pair  # bounds on e, (K, m)
+    upper: _Pair
+    above: _Pair  # t − c of the hinges, (K, p)
+    t: _Pair
+    plus: _Pair  # terminal slack s⁺, its multiplier ρ − ν, (q,)
+    minus: _Pair
+    high: _Pair  # τ − w of the terminal box, (q,)
+    low: _Pair  # τ + w
+    ball: _Pair  # (K,), or (0,) where there are no balls
 
     def gap(self) -> float:
         """Mean of s z over the finite inequalities."""
-        joined = np.concatenate([s[i := np.isfinite(s)] * z[i] for s, z in self.couples()])
+        joined = np.concatenate([s[i := np.isfinite(s)] * z[i] for s, z in self])
         return float(joined.mean()) if joined.size else 0.0
 
     def moved(self, change: _Pairs, step: float) -> _Pairs:
-        ours = [getattr(self, f.name) for f in dataclasses.fields(self)]
-        theirs = [getattr(change, f.name) for f in dataclasses.fields(self)]
-        return _Pairs(*(a + step * b for a, b in zip(ours, theirs, strict=True)))
+        """These and a part of their change."""
+        pairs = zip(self, change, strict=True)
+        return _Pairs(*(_Pair(a.s + step * b.s, a.z + step * b.z) for a, b in pairs))
+
+    def longest_step(self, change: _Pairs) -> float:
+        """Longest step in [0, 1] that keeps every slack and multiplier non-negative."""
+        step = 1.0
+        for pair, moves in zip(self, change, strict=True):
+            for value, delta in zip(pair, moves, strict=True):
+                shrinking = delta < 0.0
+                if shrinking.any():
+                    step = min(step, float(np.min(value[shrinking] / -delta[shrinking])))
+        return step
 
 
-def interior_point(sub: Subproblem, kkt: BandedKkt) -> tuple[Point | None, Array, int]:
-    """Solve the sub-problem loaded in `kkt`.
+@dataclasses.dataclass(frozen=True)
+class _State:
+    """Where the method is: a point, slacks and multipliers, and w, the residual in the box."""
 
-    Returns:
-        The point (None if it fails), multipliers of the balls (K,) or (0,), LQ solves.
+    point: PrimalDual
+    pairs: _Pairs
+    w: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Interior:
+    """What the method found.
+
+    Attributes:
+        point: the solution, or None if it failed.
+        press: multipliers of the balls, (K,) or (0,).
+        solves: LQ solves.
     """
-    K, n = sub.f.shape
-    q, boxed, balls = len(sub.g), sub.tolerance > 0.0, sub.radius < np.inf
-    # A strictly feasible start: controls inside their bounds, states by the dynamics.
-    e = _inside(sub.lower, sub.upper)
+
+    point: PrimalDual | None
+    press: Array
+    solves: int
+
+
+def interior_point(sub: Subproblem, lq: LqProblem) -> Interior:
+    """Solve the sub-problem loaded in `lq`."""
+    state = best = _start(sub)
+    best_error, best_step, sigma = np.inf, 0, 0.5
+    size = 1.0 + np.abs(sub.G @ state.point.d[-1] + sub.g)
+    scale = max(1.0, float(np.max(np.abs(sub.r))), sub.rho * 1e-3)
+    for steps in range(1, _MAX_STEPS + 1):
+        direction = _direction(sub, lq, state, sigma * state.pairs.gap())
+        if direction is None:
+            break
+        step = min(1.0, 0.99 * state.pairs.longest_step(direction.pairs))
+        sigma = min(0.5, max(0.02, (1.0 - step) ** 2))
+        state = _State(
+            state.point.towards(direction.point, step),
+            state.pairs.moved(direction.pairs, step),
+            state.w + step * direction.w,
+        )
+        error = _error(sub, state, size, scale)
+        if error < _GAP:
+            return Interior(state.point, state.pairs.ball.z, steps)
+        if error < 0.5 * best_error:
+            best_error, best_step, best = error, steps, state
+        elif best_error < _ENOUGH and steps > best_step + _IDLE:
+            break  # rounding errors have taken over
+    good = best_error < _ENOUGH
+    return Interior(best.point if good else None, best.pairs.ball.z, steps)
+
+
+def _error(sub: Subproblem, state: _State, size: Array, scale: float) -> float:
+    """The gap relative to the cost, or what a condition lacks relative to its size."""
+    point, pairs = state.point, state.pairs
+    residual = sub.G @ point.d[-1] + sub.g - state.w - pairs.plus.s + pairs.minus.s
+    off = [np.abs(residual) / size]
+    if len(pairs.ball.s):
+        off.append(np.abs(pairs.ball.s + _passed(sub, point.e)) / sub.radius)
+    cost = max(scale, abs(sub.objective(point.d, point.e)))
+    return max(pairs.gap() / cost, float(np.max(np.concatenate(off), initial=0.0)))
+
+
+def _start(sub: Subproblem) -> _State:
+    """A strictly feasible one: controls inside their bounds, states by the dynamics."""
+    q, balls = len(sub.g), sub.radius < np.inf
+    width = np.where(np.isfinite(sub.upper - sub.lower), 0.1 * (sub.upper - sub.lower), 1.0)
+    e = np.clip(0.0, sub.lower + width, sub.upper - width)
     if balls:
         u = e - sub.center
         within = 0.5 * sub.radius / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300)
         shrunk = np.minimum(within, 1.0) * u + sub.center
         e = shrunk if ((sub.lower < shrunk) & (shrunk < sub.upper)).all() else e
     d = sub.response(e)
-    point = Point(d, e, np.zeros((K, n)), np.zeros(q))
-    c = np.matmul(sub.a, d[..., None])[..., 0] + sub.b
-    residual = sub.G @ d[-1] + sub.g
-    t = np.maximum(c, 0.0) + 1.0
-    size = 1.0 + np.abs(residual)
-    infinite, none = np.full(q, np.inf), np.zeros(q)
-    box = np.full(q, sub.tolerance) if boxed else infinite
-    lower, upper = e - sub.lower, sub.upper - e
-    with np.errstate(invalid="ignore"):
-        pairs = _Pairs(
-            lower=lower,
-            z_lower=np.where(np.isfinite(lower), 1.0, 0.0),
-            upper=upper,
-            z_upper=np.where(np.isfinite(upper), 1.0, 0.0),
-            above=t - c,
-            z_above=0.5 * sub.h * t + 1e-6,
-            t=t,
-            z_t=0.5 * sub.h * t + 1e-6,
-            plus=np.maximum(residual, 0.0) + size,
-            z_plus=np.full(q, sub.rho),
-            minus=np.maximum(-residual, 0.0) + size,
-            z_minus=np.full(q, sub.rho),
-            high=box,
-            z_high=np.ones(q) if boxed else none,
-            low=box,
-            z_low=np.ones(q) if boxed else none,
-            ball=np.maximum(-_passed(sub, e), 0.1 * sub.radius) if balls else np.zeros(0),
-            z_ball=np.ones(K if balls else 0),
-        )
-    w, sigma = np.zeros(q), 0.5
-    best = (np.inf, 0, point, pairs.z_ball)
-    scale = max(1.0, float(np.max(np.abs(sub.r))), sub.rho * 1e-3)
-    for steps in range(1, _MAX_STEPS + 1):
-        found = _direction(sub, kkt, point, pairs, w, sigma * pairs.gap())
-        if found is None:
-            break
-        target, change, dw = found
-        step = min(1.0, 0.99 * _longest(pairs, change))
-        sigma = min(0.5, max(0.02, (1.0 - step) ** 2))
-        point = point.towards(target, step)
-        pairs = pairs.moved(change, step)
-        w = w + step * dw
-        missing = np.abs(sub.G @ point.d[-1] + sub.g - w - pairs.plus + pairs.minus) / size
-        size_of_cost = max(scale, abs(sub.objective(point.d, point.e)))
-        if balls:
-            off = np.abs(pairs.ball + _passed(sub, point.e)) / sub.radius
-            missing = np.concatenate([missing, off])
-        off_by = max(pairs.gap() / size_of_cost, float(np.max(missing, initial=0.0)))
-        if off_by < _GAP:
-            return point, pairs.z_ball, steps
-        if off_by < 0.5 * best[0]:
-            best = (off_by, steps, point, pairs.z_ball)
-        elif best[0] < _ENOUGH and steps > best[1] + _IDLE:
-            break  # rounding errors have taken over
-    return (best[2] if best[0] < _ENOUGH else None), best[3], steps
+    c, residual = sub.hinge_arguments(d), sub.G @ d[-1] + sub.g
+    t, size = np.maximum(c, 0.0) + 1.0, 1.0 + np.abs(residual)
+    pull, rho = 0.5 * sub.h * t + 1e-6, np.full(q, sub.rho)
+    box = np.full(q, sub.tolerance if sub.tolerance > 0.0 else np.inf)
+    pairs = _Pairs(
+        lower=_one(e - sub.lower),
+        upper=_one(sub.upper - e),
+        above=_Pair(t - c, pull),
+        t=_Pair(t, pull),
+        plus=_Pair(np.maximum(residual, 0.0) + size, rho),
+        minus=_Pair(np.maximum(-residual, 0.0) + size, rho),
+        high=_one(box),
+        low=_one(box),
+        ball=_one(np.maximum(-_passed(sub, e), 0.1 * sub.radius) if balls else np.zeros(0)),
+    )
+    return _State(PrimalDual(d, e, np.zeros_like(d), np.zeros(q)), pairs, np.zeros(q))
 
 
-def _inside(lower: Array, upper: Array) -> Array:
-    """Zero where it lies well inside the bounds, else a tenth of the way in."""
-    width = np.where(np.isfinite(upper - lower), 0.1 * (upper - lower), 1.0)
-    return np.clip(0.0, lower + width, upper - width)
+def _one(slack: Array) -> _Pair:
+    """Multipliers of one where there is an inequality."""
+    return _Pair(slack, np.where(np.isfinite(slack), 1.0, 0.0))
 
 
 def _passed(sub: Subproblem, e: Array) -> Array:
@@ -158,87 +179,117 @@ def _passed(sub: Subproblem, e: Array) -> Array:
     return 0.5 * (np.sum(u * u, axis=1) / sub.radius - sub.radius)
 
 
-def _longest(pairs: _Pairs, change: _Pairs) -> float:
-    """Longest step in [0, 1] that keeps every slack and multiplier non-negative."""
-    step = 1.0
-    for (s, z), (ds, dz) in zip(pairs.couples(), change.couples(), strict=True):
-        for value, delta in ((s, ds), (z, dz)):
-            shrinking = delta < 0.0
-            if shrinking.any():
-                step = min(step, float(np.min(value[shrinking] / -delta[shrinking])))
-    return step
+def _direction(sub: Subproblem, lq: LqProblem, state: _State, mu: float) -> _State | None:
+    """Newton's target for s z = μ; the change of slacks and multipliers, and of the box's w.
 
-
-def _direction(
-    sub: Subproblem, kkt: BandedKkt, point: Point, pairs: _Pairs, w: Array, mu: float
-) -> tuple[Point, _Pairs, Array] | None:
-    """Newton's target for s z = μ, the change of slacks and multipliers, and of the box's w."""
-    p = pairs
-    # Bounds.
-    over_l, over_u = p.z_lower / p.lower, p.z_upper / p.upper
-    push = mu / p.upper - mu / p.lower - (over_l + over_u) * point.e
-    # Hinges: the force on their row is force + omega Δc once Δt is eliminated.
-    g1, g2 = p.z_above / p.above, p.z_t / p.t
-    D = sub.h + g1 + g2
-    rest = mu / p.above + mu / p.t - sub.h * p.t
-    omega = g1 * (sub.h + g2) / D
-    c = p.t - p.above
-    force = mu / p.above - g1 * rest / D - omega * (c - sub.b)
-    # Terminal slacks and the box.
-    soft = p.plus / p.z_plus + p.minus / p.z_minus
-    right = -sub.g + mu / p.z_plus - mu / p.z_minus - soft * point.terminal
-    if sub.tolerance > 0.0:
-        W = p.z_high / p.high + p.z_low / p.low
-        lean = (mu / p.low - mu / p.high) / W
-        soft, right = soft + 1.0 / W, right + w + lean
-    held = np.ones(len(sub.g), dtype=bool)
-    block = (over_l + over_u)[..., None] * np.eye(push.shape[1])
-    ray, balls = None, len(p.ball) > 0
-    if balls:
-        u = point.e - sub.center
-        turn, over_b = u / sub.radius, p.z_ball / p.ball
-        off = p.ball + _passed(sub, point.e)
-        ray = turn, over_b, np.sum(turn * point.e, axis=1) - off
-        curvature = p.z_ball / sub.radius
-        block = block + curvature[:, None, None] * np.eye(push.shape[1])
-        push = push + (mu / p.ball)[:, None] * turn - curvature[:, None] * point.e
-    target = kkt.solve(omega, force, held, -soft, right, (block, push), ray)
+    Every kind of inequality is eliminated into the LQ problem, and recovered from its solution.
+    """
+    pairs = state.pairs
+    block, push, bounds_of = _bounds(state, mu)
+    ray, ball_of = None, lambda target: _Pair(pairs.ball.s, pairs.ball.z)
+    if len(pairs.ball.s):
+        bent, pressed, ray, ball_of = _balls(sub, state, mu)
+        block, push = block + bent, push + pressed
+    omega, force, hinges_of = _hinges(sub, state, mu)
+    soft, side, terminal_of = _terminal(sub, state, mu)
+    end = End(np.ones(len(sub.g), dtype=bool), soft, side)
+    target = lq.solve(Terms(omega, force, end, block, push, ray))
     if target is None:
         return None
-    de = target.e - point.e
-    dc = np.matmul(sub.a, (target.d - point.d)[..., None])[..., 0]
-    dt = (rest + g1 * dc) / D
-    dnu = target.terminal - point.terminal
-    dw = target.terminal / W + lean if sub.tolerance > 0.0 else np.zeros_like(w)
-    dplus = (mu + p.plus * dnu) / p.z_plus - p.plus
-    dminus = (mu - p.minus * dnu) / p.z_minus - p.minus
-    # The larger slack follows from the condition itself: its multiplier ρ ∓ ν is a small
-    # difference, and dividing by it would lose all digits.
-    residual = sub.G @ target.d[-1] + sub.g - w - dw
-    above = p.plus >= p.minus
-    dplus, dminus = (
-        np.where(above, residual + p.minus + dminus - p.plus, dplus),
-        np.where(above, dminus, p.plus + dplus - residual - p.minus),
-    )
-    dball = -off - np.sum(turn * de, axis=1) if balls else p.ball
-    change = _Pairs(
-        lower=np.where(np.isfinite(p.lower), de, 0.0),
-        z_lower=mu / p.lower - over_l * de - p.z_lower,
-        upper=np.where(np.isfinite(p.upper), -de, 0.0),
-        z_upper=mu / p.upper + over_u * de - p.z_upper,
-        above=dt - dc,
-        z_above=mu / p.above - g1 * (dt - dc) - p.z_above,
-        t=dt,
-        z_t=mu / p.t - g2 * dt - p.z_t,
-        plus=dplus,
-        z_plus=np.where(above, (mu - p.z_plus * dplus) / p.plus - p.z_plus, -dnu),
-        minus=dminus,
-        z_minus=np.where(above, dnu, (mu - p.z_minus * dminus) / p.minus - p.z_minus),
-        high=np.where(np.isfinite(p.high), -dw, 0.0),
-        z_high=mu / p.high + p.z_high / p.high * dw - p.z_high,
-        low=np.where(np.isfinite(p.low), dw, 0.0),
-        z_low=mu / p.low - p.z_low / p.low * dw - p.z_low,
-        ball=dball,
-        z_ball=mu / p.ball - over_b * dball - p.z_ball if balls else p.z_ball,
-    )
-    return target, change, dw
+    dw, terminal = terminal_of(target)
+    change = _Pairs(**bounds_of(target), **hinges_of(target), **terminal, ball=ball_of(target))
+    return _State(target, change, dw)
+
+
+def _moved(pair: _Pair, ds: Array, mu: float) -> _Pair:
+    """Changes of a slack, by ds, and of its multiplier, by s z = μ linearised."""
+    s, z = pair
+    return _Pair(np.where(np.isfinite(s), ds, 0.0), (mu - z * ds) / s - z)
+
+
+def _bounds(
+    state: _State, mu: float
+) -> tuple[Array, Array, Callable[[PrimalDual], dict[str, _Pair]]]:
+    """What bounds add to R (K, m, m) and r (K, m): z/s, and the rest."""
+    e, lower, upper = state.point.e, state.pairs.lower, state.pairs.upper
+    stiff = lower.z / lower.s + upper.z / upper.s
+    push = mu / upper.s - mu / lower.s - stiff * e
+
+    def recover(target: PrimalDual) -> dict[str, _Pair]:
+        de = target.e - e
+        return {"lower": _moved(lower, de, mu), "upper": _moved(upper, -de, mu)}
+
+    return stiff[..., None] * np.eye(e.shape[1]), push, recover
+
+
+def _balls(
+    sub: Subproblem, state: _State, mu: float
+) -> tuple[Array, Array, Ray, Callable[[PrimalDual], _Pair]]:
+    """What balls s + (‖u‖² − r²)/(2r) = 0 add to R and r, and along t = u/r."""
+    e, (s, z) = state.point.e, state.pairs.ball
+    turn = (e - sub.center) / sub.radius
+    off, curvature = s + _passed(sub, e), (z / sub.radius)[:, None]
+    push = (mu / s)[:, None] * turn - curvature * e
+    ray = Ray(turn, z / s, np.sum(turn * e, axis=1) - off)
+
+    def recover(target: PrimalDual) -> _Pair:
+        return _moved(state.pairs.ball, -off - np.sum(turn * (target.e - e), axis=1), mu)
+
+    return curvature[..., None] * np.eye(e.shape[1]), push, ray, recover
+
+
+def _hinges(
+    sub: Subproblem, state: _State, mu: float
+) -> tuple[Array, Array, Callable[[PrimalDual], dict[str, _Pair]]]:
+    """Weight ω and force on the hinges' rows, (K, p): the force is that + ω Δc, Δt eliminated."""
+    above, t = state.pairs.above, state.pairs.t
+    g1, g2 = above.z / above.s, t.z / t.s
+    D = sub.h + g1 + g2
+    rest = mu / above.s + mu / t.s - sub.h * t.s
+    omega = g1 * (sub.h + g2) / D
+    force = mu / above.s - g1 * rest / D - omega * (t.s - above.s - sub.b)
+
+    def recover(target: PrimalDual) -> dict[str, _Pair]:
+        dc = np.matmul(sub.a, (target.d - state.point.d)[..., None])[..., 0]
+        dt = (rest + g1 * dc) / D
+        return {"above": _moved(above, dt - dc, mu), "t": _moved(t, dt, mu)}
+
+    return omega, force, recover
+
+
+def _terminal(
+    sub: Subproblem, state: _State, mu: float
+) -> tuple[Array, Array, Callable[[PrimalDual], tuple[Array, dict[str, _Pair]]]]:
+    """Softness δ and side s of the terminal rows, (q,), for the slacks and the box."""
+    plus, minus, high, low = state.pairs.plus, state.pairs.minus, state.pairs.high, state.pairs.low
+    nu, w, boxed = state.point.terminal, state.w, sub.tolerance > 0.0
+    soft = plus.s / plus.z + minus.s / minus.z
+    side = -sub.g + mu / plus.z - mu / minus.z - soft * nu
+    inverse, lean = np.zeros_like(w), np.zeros_like(w)
+    if boxed:
+        inverse = 1.0 / (high.z / high.s + low.z / low.s)
+        lean = (mu / low.s - mu / high.s) * inverse
+        soft, side = soft + inverse, side + w + lean
+
+    def recover(target: PrimalDual) -> tuple[Array, dict[str, _Pair]]:
+        dnu, dw = target.terminal - nu, target.terminal * inverse + lean
+        ds_plus = (mu + plus.s * dnu) / plus.z - plus.s
+        ds_minus = (mu - minus.s * dnu) / minus.z - minus.s
+        # The larger slack follows from the condition itself: its multiplier ρ ∓ ν is a small
+        # difference, and dividing by it would lose all digits.
+        residual = sub.G @ target.d[-1] + sub.g - w - dw
+        above = plus.s >= minus.s
+        ds_plus, ds_minus = (
+            np.where(above, residual + minus.s + ds_minus - plus.s, ds_plus),
+            np.where(above, ds_minus, plus.s + ds_plus - residual - minus.s),
+        )
+        dz_plus = np.where(above, (mu - plus.z * ds_plus) / plus.s - plus.z, -dnu)
+        dz_minus = np.where(above, dnu, (mu - minus.z * ds_minus) / minus.s - minus.z)
+        return dw, {
+            "plus": _Pair(ds_plus, dz_plus),
+            "minus": _Pair(ds_minus, dz_minus),
+            "high": _moved(high, -dw, mu),
+            "low": _moved(low, dw, mu),
+        }
+
+    return soft, side, recover

@@ -15,8 +15,8 @@ import numpy as np
 import osqp
 from scipy import sparse
 
-from slipcar.planner.convex.convexify import Subproblem
-from slipcar.planner.convex.solvers import Solution, failed
+from slipcar.planner.convex.solvers.interface import Solution, failed
+from slipcar.planner.convex.subproblem import Subproblem
 
 Array = np.ndarray
 
@@ -123,9 +123,9 @@ class _Pattern:
         self.d = np.arange(K * n).reshape(K, n)
         self.e = K * n + np.arange(K * m).reshape(K, m)
         self.t = K * (n + m) + np.arange(K * p).reshape(K, p)
-        first = K * (n + m + p)
-        self.plus, self.minus = first + np.arange(q), first + q + np.arange(q)
-        self.variables = first + 2 * q
+        begin = K * (n + m + p)
+        self.plus, self.minus = begin + np.arange(q), begin + q + np.arange(q)
+        self.variables = begin + 2 * q
         # P: upper triangles of Q and R, the diagonal of h.
         self.upper_n, self.upper_m = np.triu_indices(n), np.triu_indices(m)
         P = [

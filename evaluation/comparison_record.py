@@ -1,0 +1,87 @@
+"""The record of a comparison: what was run and what came of it.
+
+:class:`slipcar.evaluation.Comparison` is one that can also write itself as text and figures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from slipcar.envs.scenario import Scenario
+from slipcar.evaluation.metrics import Result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Per-episode metrics whose paired differences against the reference row are shown.
+DIFFERENCES = {
+    "total_difference": "total",
+    "collision_difference": "collision",
+    "between_difference": "touched",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ComparisonRecord:
+    """Rows of controllers over common Brownian paths.
+
+    Attributes:
+        scenario: the world.
+        episodes: a row; the most, where they differ.
+        seed: of the Brownian paths.
+        substeps: Euler–Maruyama steps in each control interval.
+        reference: name of the row that differences are taken against.
+        controllers: name -> controller, in order.
+        results: name -> result, of the rows that finished.
+        errors: name -> message, of the rows that raised.
+        reused: names of the rows that were read from the folder.
+        warnings: what a reader must be told: intervals too wide, work that could not be kept.
+        wall_time: seconds the comparison took.
+        provenance: versions, machine, date, commit.
+    """
+
+    scenario: Scenario
+    episodes: int
+    seed: int
+    substeps: int
+    reference: str
+    controllers: dict[str, Any]
+    results: dict[str, Result]
+    errors: dict[str, str]
+    reused: tuple[str, ...]
+    warnings: tuple[str, ...]
+    wall_time: float
+    provenance: dict[str, Any]
+
+    @functools.cached_property
+    def frame(self) -> pd.DataFrame:
+        """One row a controller, raw numbers in SI units; differences are to `reference`."""
+        import pandas as pd
+
+        rows = {}
+        for name in self.controllers:
+            row: dict[str, Any] = {"error": self.errors.get(name, "")}
+            if name in self.results:
+                row.update(self.results[name].summary())
+                row.update(self._differences(name))
+            rows[name] = row
+        columns = list(dict.fromkeys(key for row in rows.values() for key in row if key != "error"))
+        frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns, "error"])
+        return frame.rename_axis("controller")
+
+    def _differences(self, name: str) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for label, metric in DIFFERENCES.items():
+            mean = low = high = float("nan")
+            if name != self.reference and self.reference in self.results:
+                reference = self.results[self.reference]
+                mean, low, high = self.results[name].difference(reference, metric)
+            found.update({label: mean, f"{label}_low": low, f"{label}_high": high})
+        return found
+
+    def to_csv(self, path: str | Path | None = None) -> str | None:
+        """Raw numbers as CSV: the text, or None after writing it to `path`."""
+        return self.frame.to_csv(path)

@@ -1,0 +1,341 @@
+"""The stochastic SCP iteration (paper §3.1): linearise, solve LOCP_{k+1}, judge the step.
+
+    repeat   linearise at (u_k, μ_k)            problem.linearization, moments
+             solve the convex sub-problem       subproblem, solvers
+             accept or shorten                  merit, trust_region
+    until    ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt ≤ tolerance
+
+and the mean is, to first order, what the controls do: over long horizons and for cheap controls
+the step alone says little about the path.
+
+Steps are long at first: they find a way round the obstacles. The linearisation is then crude, and
+limits on the controls would make it saturate them, up to paths from which no way leads on: they
+act from when steps have become short. Should the iteration settle all the same where the terminal
+condition cannot be met, it is run once more, with limits and short steps from the beginning. At
+the end, where convergence is linear, steps are lengthened or combined (:mod:`.acceleration`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+
+from slipcar.planner.convex.acceleration import Acceleration
+from slipcar.planner.convex.merit import Iterate, Merit, iterate_at, model_merit, variance_of
+from slipcar.planner.convex.solvers.interface import Solution, Solver
+from slipcar.planner.convex.subproblem import Subproblem, convexify
+from slipcar.planner.convex.trust_region import Step, TrustRegion
+from slipcar.planner.history import Iteration
+from slipcar.planner.moments import covariance as moments
+from slipcar.planner.options import Options
+from slipcar.planner.outcome import Outcome
+from slipcar.planner.problem.feasibility import (
+    FEASIBILITY,
+    inconsistency,
+    not_finite,
+    terminal_force,
+    what_lacks,
+)
+from slipcar.planner.problem.linearization import linearize
+from slipcar.planner.problem.model import Model
+from slipcar.planner.status import Status
+
+Array = np.ndarray
+
+#: Weight of the terminal penalty at first, per unit of the multiplier it must exceed; how often
+#: it is raised tenfold; and the part of the virtual control that this must remove to go on.
+_FIRST_RHO, _RAISES, _WORTHWHILE = 1e3, 3, 0.01
+#: A converged plan leaves no more than this between its mean and the path that its controls
+#: lead to, per unit of the state.
+_CONSISTENCY = 1e-4
+#: Control bounds act once ∫ ‖u_{k+1} − u_k‖² dt is this small beside ∫ ‖u_{k+1}‖² dt.
+_SHORT = 0.03
+#: Multipliers tried, at most, for a step that fits its trust region.
+_TRIES = 60
+
+
+def iterate(
+    model: Model, solver: Solver, trust: TrustRegion, options: Options, x: Array, u: Array
+) -> Outcome:
+    """Run the loop from the guess x (N, n), u (N−1, m).
+
+    Raises:
+        ValueError: if the model functions are not finite along the guess.
+    """
+    bold = _Attempt(model, solver, trust, options, x, u).run()
+    left = options.max_iterations - len(bold.history)
+    if bold.status is not Status.INFEASIBLE or left <= 0:
+        return bold
+    opening = bold.history[0]
+    cautious = trust.cautious(opening.predicted / max(opening.trust_radius, 1e-300))
+    if cautious is None:
+        return bold
+    options = dataclasses.replace(options, max_iterations=left)
+    careful = _Attempt(model, solver, cautious, options, x, u).run()
+    off_careful, off_bold = (
+        inconsistency(linearize(model, end.x, end.u), options.terminal_tolerance)
+        for end in (careful, bold)
+    )
+    better = careful.status in (Status.CONVERGED, Status.STOPPED) or off_careful < off_bold
+    history = (*bold.history, *careful.history)
+    best = careful if better else bold
+    return dataclasses.replace(best, iterations=len(history), history=history)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Proposal:
+    """A sub-problem and its solution."""
+
+    sub: Subproblem
+    solution: Solution
+    radius: float  # ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts
+    multiplier: float  # of the trust region, −p¹
+    step: float  # ∫ ‖u_{k+1} − u_k‖² dt
+
+
+@dataclasses.dataclass(frozen=True)
+class _Candidate:
+    """What the non-linear problem makes of a proposal."""
+
+    at: Iterate
+    merit: float
+    before: float  # Φ at the iterate
+    predicted: float  # decrease of Φ by the model
+    actual: float  # decrease of Φ, −∞ where something is not finite
+
+
+class _Attempt:
+    """One run of the loop: the iterate, its multipliers, and what has been tried."""
+
+    def __init__(
+        self, model: Model, solver: Solver, trust: TrustRegion, options: Options, x: Array, u: Array
+    ) -> None:
+        self.model, self.solver, self.trust, self.options = model, solver, trust, options
+        clock = time.perf_counter()
+        self.at = iterate_at(model, options.variance_weight, x, u)
+        self.linearize_seconds = time.perf_counter() - clock
+        lin = self.at.lin
+        if not lin.finite:
+            raise ValueError(f"{not_finite(lin)} is not finite along the guess")
+        self.adjoint, self.terminal = np.zeros(lin.defect.shape), np.zeros(lin.g.shape)
+        self.trust_multiplier = 0.0
+        self.rho = self.first_rho = _FIRST_RHO * max(1.0, terminal_force(model, lin))
+        self.raises, self.lacked, self.last_step = 0, np.inf, np.inf
+        self.acceleration = Acceleration(model.dt)
+        self.history: list[Iteration] = []
+        # While steps are long the controls have no limits: see the module's docstring.
+        limited = model.bounded or model.radius < np.inf
+        self.relaxed = _without_limits(model) if trust.bold and limited else None
+
+    def run(self) -> Outcome:
+        """Iterate to the end."""
+        trust, options = self.trust, self.options
+        for _ in range(options.max_iterations):
+            clock = time.perf_counter()
+            proposal = self.solve()
+            solved = time.perf_counter()
+            if not proposal.solution.found:
+                # A shorter step is an easier sub-problem; a schedule that knows none gives up.
+                self.relaxed = None
+                trust.judge(Step(np.nan, 0.0, -np.inf, np.inf, np.inf))
+                if trust.collapsed:
+                    return self.outcome(Status.SOLVER_FAILED, proposal.solution.message)
+                continue
+            new = self.evaluate(proposal)
+            promised = max(new.predicted, 0.0)
+            accepted = trust.judge(
+                Step(proposal.radius, promised, new.actual, new.merit, new.before)
+            )
+            if not accepted or trust.multiplier > 0.0:
+                self.acceleration.forget()
+            seconds = self.linearize_seconds + time.perf_counter() - solved, solved - clock
+            self.linearize_seconds = 0.0
+            self.history.append(self.record(proposal, new, accepted, *seconds))
+            unlimited = self.limit_controls(proposal, new, accepted)
+            stop = options.callback is not None and options.callback(self.history[-1])
+            if accepted:
+                status = self.accept(proposal, new, np.inf if unlimited else proposal.step)
+                if status is Status.CONVERGED:
+                    return self.outcome(status)
+                if status is Status.INFEASIBLE:
+                    lacks = what_lacks(self.at.lin, options.terminal_tolerance, self.size)
+                    return self.outcome(status, lacks)
+            elif trust.collapsed:
+                return self.outcome(Status.STALLED)
+            if stop:
+                return self.outcome(Status.STOPPED)
+        return self.outcome(Status.MAX_ITERATIONS)
+
+    def solve(self) -> _Proposal:
+        """Solve the sub-problem with the multiplier that the trust region asks for."""
+        model, options, trust = self.relaxed or self.model, self.options, self.trust
+        weight: Array | None = None
+        for _ in range(_TRIES):
+            if weight is None and (trust.multiplier > 0.0 or trust.limits_radius):
+                weight = self.trust_weight()
+            multiplier = trust.multiplier
+            sub = convexify(
+                model,
+                self.at.lin,
+                variance=self.at.variance,
+                composite=options.linearization == "composite",
+                trust_multiplier=multiplier,
+                trust_weight=weight,
+                rho=self.rho,
+                tolerance=options.terminal_tolerance,
+            )
+            solution = self.solver.solve(sub)
+            if not solution.found:
+                return _Proposal(sub, solution, np.nan, multiplier, np.nan)
+            d = solution.d
+            if weight is None:
+                radius = float(np.vdot(model.dt[:, None] * d, d))
+            else:
+                radius = 0.5 * float(np.vdot(d, np.matmul(weight, d[..., None])[..., 0]))
+            if trust.fits(radius):
+                break
+        step = float(np.vdot(model.dt[:, None] * solution.e, solution.e))
+        return _Proposal(sub, solution, radius, multiplier, step)
+
+    def trust_weight(self) -> Array:
+        """Hessian blocks of ∫ E‖x − x_k‖² dt: those of the variance penalty, but for its weight."""
+        variance, weight = self.at.variance, self.options.variance_weight
+        if variance is None:
+            variance, weight = variance_of(self.model, self.at.lin, 1.0), 1.0
+        assert variance is not None
+        return moments.trust_region_weight(variance.hessian / weight, self.model.dt)
+
+    def evaluate(self, proposal: _Proposal) -> _Candidate:
+        """Where the step leads, lengthened or combined with others if they have become slow."""
+        model, options, trust = self.model, self.options, self.trust
+        lin, solution = self.at.lin, proposal.solution
+        x = lin.x.copy()
+        x[1:] += solution.d
+        merit = Merit(solution, options.terminal_tolerance, self.rho)
+        before = merit(self.at)
+        trust_cost = proposal.multiplier * proposal.radius
+        composite = options.linearization == "composite"
+        predicted = before - model_merit(self.at, solution, trust_cost, composite=composite)
+        new = iterate_at(model, options.variance_weight, x, lin.u + solution.e)
+        after = merit(new)
+        far = proposal.step + self.last_step > options.tolerance
+        free = trust.accelerates and self.relaxed is None and proposal.multiplier == 0.0
+        if far and free and self.acceleration.observe(lin.u, x, solution.e):
+            new = self.accelerated(new, merit, before, predicted)
+            after = merit(new)
+        actual = before - after if np.isfinite(after) and new.lin.finite else -np.inf
+        return _Candidate(new, after, before, predicted, actual)
+
+    def accelerated(self, new: Iterate, merit: Merit, before: float, predicted: float) -> Iterate:
+        """A better iterate than `new` along or between the last steps; `new` if there is none."""
+        lin, plain, here = self.at.lin, merit.lagrangian(new), merit.lagrangian(self.at)
+        ratio = (here - plain) / max(predicted - before + here, 1e-300)
+        for x, u in self.acceleration.propose(lin.x, lin.u, ratio):
+            u = self.model.admissible(u)
+            other = iterate_at(self.model, self.options.variance_weight, x, u)
+            lower = self.trust.bold or merit(other) < before
+            if other.lin.finite and lower and merit.lagrangian(other) < plain:
+                return other
+        return new
+
+    def limit_controls(self, proposal: _Proposal, new: _Candidate, accepted: bool) -> bool:
+        """Let control bounds act once steps are short; whether this one, which passed them, counts.
+
+        Returns:
+            True for a step that the bounds take back: it says nothing of convergence.
+        """
+        u = new.at.lin.u
+        if self.relaxed is None:
+            return False
+        effort = float(np.vdot(self.model.dt[:, None] * u, u))
+        if accepted and self.trust.bold and proposal.step > _SHORT * effort:
+            return False
+        self.relaxed = None
+        return not np.array_equal(self.model.admissible(u), u)
+
+    def accept(self, proposal: _Proposal, new: _Candidate, step: float) -> Status | None:
+        """Go to the new iterate; CONVERGED or INFEASIBLE if the iteration has settled there."""
+        self.at, self.trust_multiplier = new.at, proposal.multiplier
+        self.adjoint, self.terminal = proposal.solution.adjoint, proposal.solution.terminal
+        lacking = proposal.sub.virtual_control(proposal.solution.d)
+        feasible = lacking <= FEASIBILITY * self.size
+        # Where a trust region is needed to the end, a short step proves nothing by itself:
+        # the force it stands for, p¹ (x − x_k), must vanish too (beside that of the terminal
+        # penalty, where it is at its limit).
+        force = proposal.multiplier * (1.0 if feasible else self.first_rho / self.rho)
+        step += force**2 * proposal.radius
+        settled = step + self.last_step <= self.options.tolerance
+        self.last_step = step
+        tau = self.options.terminal_tolerance
+        if not (settled and inconsistency(self.at.lin, tau, lacking) <= _CONSISTENCY * self.size):
+            return None
+        if feasible:
+            return Status.CONVERGED
+        if self.raises == _RAISES or lacking > (1.0 - _WORTHWHILE) * self.lacked:
+            return Status.INFEASIBLE
+        self.acceleration.forget()
+        self.rho, self.raises, self.lacked = 10.0 * self.rho, self.raises + 1, lacking
+        self.last_step = np.inf
+        return None
+
+    @property
+    def size(self) -> float:
+        """What counts as one in the state."""
+        return 1.0 + float(np.abs(self.at.lin.x).max())
+
+    def record(
+        self,
+        proposal: _Proposal,
+        new: _Candidate,
+        accepted: bool,
+        linearize_seconds: float,
+        solve_seconds: float,
+    ) -> Iteration:
+        """A row of the history."""
+        lin, variance, solution = new.at.lin, new.at.variance, proposal.solution
+        return Iteration(
+            mean=lin.x,
+            controls=lin.u,
+            effort=lin.effort,
+            penalty=lin.penalty,
+            running=lin.running,
+            variance=np.nan if variance is None else variance.total / self.options.variance_weight,
+            merit=new.merit,
+            predicted=new.predicted,
+            actual=new.actual,
+            step=proposal.step,
+            trust_radius=proposal.radius,
+            trust_multiplier=proposal.multiplier,
+            virtual_control=proposal.sub.virtual_control(solution.d),
+            defect=float(np.abs(lin.defect).max()),
+            terminal_residual=float(np.abs(lin.g).max(initial=0.0)),
+            terminal_multiplier=solution.terminal,
+            accepted=accepted,
+            solver_iterations=solution.iterations,
+            linearize_seconds=linearize_seconds,
+            solve_seconds=solve_seconds,
+        )
+
+    def outcome(self, status: Status, message: str = "") -> Outcome:
+        """What has been reached, with controls that are admissible however it ended."""
+        model, weight, lin = self.model, self.options.variance_weight, self.at.lin
+        if not status.ok and not np.array_equal(inside := model.admissible(lin.u), lin.u):
+            lin = iterate_at(model, weight, lin.x, inside).lin
+        return Outcome.at(
+            lin,
+            model,
+            weight,
+            status=status,
+            adjoint=self.adjoint,
+            terminal=self.terminal,
+            history=tuple(self.history),
+            trust_multiplier=self.trust_multiplier,
+            message=message,
+        )
+
+
+def _without_limits(model: Model) -> Model:
+    inf = np.full(model.control_dim, np.inf)
+    return dataclasses.replace(model, lower=-inf, upper=inf, radius=np.inf)

@@ -1,0 +1,204 @@
+"""Programs and workspaces: the equations of one kind of problem, ready to run on arrays.
+
+A program is machine code (or, without LLVM, the recursions themselves, run by NumPy); a workspace is
+the arrays it runs on, for one number of intervals. Points of a workspace come in pairs, the iterate
+and the candidate: kernels run on either side, and what is `x` to one is `x_new` to the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from slipcar.planner.newton.equations import NEW, Equations, Form, Knobs, layout
+from slipcar.planner.newton.quantities import Dimensions, Filled, Traced
+from slipcar.planner.trace import emit, machine_code
+from slipcar.planner.trace.recursion import Layout, Recursion, in_numpy
+
+Array = np.ndarray
+#: Programs kept in a process; each is some hundred kilobytes.
+_KEPT = 128
+#: Beyond this sum of states, controls and terminal conditions NumPy is used: kernels have no loops
+#: over matrices, and grow with the cube.
+_LARGEST = 72
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Program:
+    """The equations of one kind of problem.
+
+    Attributes:
+        dims: sizes.
+        form: which equations.
+        layout: arrays.
+        recursions: by name.
+        code: machine code, or None: NumPy runs the recursions.
+        filled: whether NumPy fills the problem's quantities in.
+    """
+
+    dims: Dimensions
+    form: Form
+    layout: Layout
+    recursions: Mapping[str, Recursion]
+    code: machine_code.Code | None
+    filled: Filled | None
+
+
+def compilable(dims: Dimensions) -> bool:
+    """Whether kernels of such a problem are short enough to be compiled."""
+    return dims.n + dims.m + dims.q <= _LARGEST
+
+
+_programs: OrderedDict[Any, Program] = OrderedDict()
+_lock = threading.RLock()
+
+
+def program_of(problem: Traced | Filled, form: Form, structure: bytes, native: bool) -> Program:
+    """The program of a kind of problem, compiled where it is not known.
+
+    Args:
+        problem: its quantities.
+        form: which equations.
+        structure: what tells kinds apart: of the trace, or of the dimensions.
+        native: machine code rather than NumPy; the caller knows that there is LLVM.
+    """
+    filled = problem if isinstance(problem, Filled) else None
+    key = (structure, problem.dims, form, native)
+    with _lock:
+        program = _programs.get(key)
+        if program is None:
+            program = _programs[key] = _made(problem, filled, form, repr(key).encode(), native)
+            while len(_programs) > _KEPT:
+                _programs.popitem(last=False)
+        else:
+            _programs.move_to_end(key)
+    return program
+
+
+def _made(
+    problem: Traced | Filled, filled: Filled | None, form: Form, key: bytes, native: bool
+) -> Program:
+    fields = layout(problem.dims, form, *((filled.own, filled.second) if filled else ({}, {})))
+    recursions = {r.name: r for r in Equations(problem, form).recursions}
+    code = None
+    if native:
+        code = machine_code.code(
+            key, list(recursions), functools.partial(_assembly, problem, recursions, fields),
+            _estimate(problem.dims),
+        )  # fmt: skip
+    return Program(problem.dims, form, fields, recursions, code, filled)
+
+
+def _assembly(problem: Any, recursions: Mapping[str, Recursion], fields: Layout) -> str:
+    if isinstance(problem, Filled):
+        from slipcar.planner.trace.graph import Graph
+
+        return emit.module(list(recursions.values()), Graph(), fields, {})
+    known = {name: getattr(problem, name) for name in ("A", "B", "C", "G")}
+    return emit.module(list(recursions.values()), problem.graph, fields, known)
+
+
+def _estimate(dims: Dimensions) -> str:
+    """What to say before a compilation that takes longer than a second; empty otherwise."""
+    size = dims.n + dims.m + dims.q
+    seconds = 4e-5 * size**3
+    if seconds < 1.0:
+        return ""
+    return f"compiling for {dims.n} states and {dims.m} controls, some {seconds:.0f} s (once) ..."
+
+
+class Workspace:
+    """Arrays of a program for K intervals, and its kernels on either side.
+
+    Attributes:
+        program: what runs.
+        K: intervals.
+        arrays: by name, (K + 1, width) or (1, width) each.
+    """
+
+    def __init__(self, program: Program, K: int) -> None:
+        self.program, self.K = program, K
+        self.arrays = {
+            name: np.zeros((1 if field.single else K + 1, field.width))
+            for name, field in program.layout.items()
+        }
+        swapped = [
+            {name: self.arrays[_other(name, program.layout) if side else name]
+             for name in program.layout}
+            for side in (0, 1)
+        ]  # fmt: skip
+        self._sides = swapped
+        self._tables = [
+            np.array([a.ctypes.data for a in side.values()], dtype=np.int64) for side in swapped
+        ]
+        self.knobs = memoryview(self.arrays["knob"].reshape(-1))
+        self._kernels: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {
+            name: (self._bound(name, 0), self._bound(name, 1)) for name in program.recursions
+        }
+
+    def kernel(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
+        """A kernel on either side."""
+        return self._kernels[name]
+
+    def view(self, name: str) -> memoryview:
+        """The numbers of an array that has one row."""
+        return memoryview(self.arrays[name].reshape(-1))
+
+    def at(self, side: int, name: str) -> Array:
+        """An array of a point, (K + 1, ...) or (1, ...): what a kernel on that side calls `name`."""
+        field = self.program.layout[name]
+        return self._sides[side][name].reshape(-1, *field.shape)
+
+    def side(self, side: int) -> dict[str, Array]:
+        """All arrays by the names that kernels on a side call them, rows flat."""
+        return self._sides[side]
+
+    def set(self, **knobs: float) -> None:
+        """Turn knobs."""
+        for name, value in knobs.items():
+            self.knobs[_KNOB[name]] = value
+
+    def _bound(self, name: str, side: int) -> Callable[[], None]:
+        program = self.program
+        if program.code is None:
+            recursion = program.recursions[name]
+            return functools.partial(in_numpy, recursion, program.layout, self._sides[side], self.K)
+        function = program.code.functions[name]
+        return functools.partial(function, self.K, self._tables[side].ctypes.data)
+
+
+_KNOB = {name: i for i, name in enumerate(Knobs._fields)}
+
+
+def _other(name: str, fields: Layout) -> str:
+    if name.endswith(NEW):
+        return name.removesuffix(NEW)
+    return name + NEW if name + NEW in fields else name
+
+
+_spare: dict[Any, list[Workspace]] = {}
+
+
+def borrow(program: Program, K: int) -> Workspace:
+    """A workspace that nobody uses; give it back with :func:`give_back`."""
+    with _lock:
+        idle = _spare.get((id(program), K))
+        if idle:
+            return idle.pop()
+    return Workspace(program, K)
+
+
+def give_back(workspace: Workspace) -> None:
+    """Keep a workspace for the next one who needs such a one."""
+    with _lock:
+        idle = _spare.setdefault((id(workspace.program), workspace.K), [])
+        if len(idle) < 4:
+            idle.append(workspace)
+        while len(_spare) > _KEPT:
+            _spare.pop(next(iter(_spare)))

@@ -1,0 +1,68 @@
+"""Numbers of the method of :mod:`.loop`, found on the random worlds; each is dimensionless."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+
+class Tuning(NamedTuple):
+    """How the iteration behaves.
+
+    Attributes:
+        free_steps: steps taken whole, with convex models, before Newton's method begins.
+        released_steps: steps without rows at most, when they are left out at first.
+        released: a step ∫ΔuᵀRΔu dt that brings them in sooner, relative to the effort.
+        settled: a step ∫ΔuᵀRΔu dt that lets Newton's method begin sooner, relative to the effort.
+        bound_rounds: changes of the set of active bounds within one iteration.
+        bound_stiffness: active bounds are held by a weight so much stiffer than the control's.
+        terminal_curvature: a multiple of ‖G d + g‖², zero at a solution, lets the recursion see
+            that the terminal condition holds: relative to the inverse of its Gramian.
+        first_shift: the first multiple of the identity added to a Hessian that is not convex, in
+            units of the largest diagonal entry of R.
+        shift_up: how it grows until the problem is convex, or when a step is rejected.
+        shift_down: how it falls after a good step.
+        inertia_trials: so many LQ problems at most to find it.
+        armijo: sufficient decrease.
+        searches: trials of a step, each half the one before.
+        long_searches: trials of the convex model's step, which is tried after `rejections`.
+        rejections: rejected steps in a row before that, or before giving up.
+        falls_back: whether there is a convex model to fall back to.
+        patience: of Newton's steps in a row, none shorter than half the shortest before them: then
+            they go round in circles, and shift and renewal are made to shorten them.
+        longest: a step ∫ΔuᵀRΔu dt at most, relative to the effort, or the guess's if larger.
+        renewal: how much of a change of the rows' weights an iteration takes over, in (0, 1].
+        least_renewal: how far it falls when steps go round in circles.
+        noise: relative accuracy of the merit function.
+        feasibility: what a converged plan may leave of the terminal condition, per unit of state.
+        consistency: and between its mean and the path its controls lead to.
+    """
+
+    free_steps: int = 20
+    released_steps: int = 10
+    released: float = 0.02
+    settled: float = 1.0
+    bound_rounds: int = 6
+    bound_stiffness: float = 1e12
+    terminal_curvature: float = 1e4
+    first_shift: float = 0.1
+    shift_up: float = 4.0
+    shift_down: float = 4.0
+    inertia_trials: int = 31
+    armijo: float = 1e-3
+    searches: int = 5
+    long_searches: int = 14
+    rejections: int = 3
+    falls_back: bool = True
+    patience: int = 8
+    longest: float = math.inf
+    renewal: float = 0.5
+    least_renewal: float = 0.05
+    noise: float = 1e-9
+    feasibility: float = 1e-6
+    consistency: float = 1e-4
+
+
+#: Of plans of the mean; and of plans that count the noise, which start from one of them.
+MEAN = Tuning()
+NOISE = MEAN._replace(free_steps=0, searches=6, rejections=8, falls_back=False, longest=0.1)

@@ -1,0 +1,82 @@
+"""A problem's numbers, checked at the boundary: shapes, finiteness, definiteness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
+    """A finite float64 array of a shape, None allowing any length of an axis.
+
+    Raises:
+        ValueError: naming it, the shape or the entry.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, not {value!r}") from error
+    if array.ndim != len(shape) or any(
+        want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
+    ):
+        wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name}{list(index)} must be finite, not {array[index]}")
+    return array
+
+
+def control_weight(value: Any) -> Array:
+    """R, (m, m), symmetric positive definite.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    R = finite("control_weight", value, (None, None))
+    if R.shape[0] != R.shape[1] or not np.allclose(R, R.T) or np.linalg.eigvalsh(R)[0] <= 0:
+        raise ValueError(f"control_weight must be symmetric positive definite, not {R!r}")
+    return R
+
+
+def node_times(value: Any) -> Array:
+    """Nodes of the time grid, (N,), increasing.
+
+    Raises:
+        ValueError: if they are not.
+    """
+    times = finite("times", value, (None,))
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        raise ValueError(f"times must be at least 2 increasing nodes, not {times!r}")
+    return times
+
+
+def start_covariance(given: Any, n: int) -> Array:
+    """Σ_0, (n, n), symmetric positive semidefinite; zero where there is none.
+
+    Raises:
+        ValueError: if it is not, naming the entries or the eigenvalue.
+    """
+    if given is None:
+        return np.zeros((n, n))
+    S = finite("start_covariance", given, (n, n))
+    largest = float(np.abs(S).max(initial=0.0))
+    if largest == 0.0:
+        return S
+    bent = np.argwhere(np.abs(S - S.T) > 1e-9 * largest)
+    if len(bent):
+        i, j = (int(index) for index in bent[0])
+        raise ValueError(
+            f"start_covariance must be symmetric, but [{i}, {j}] is {S[i, j]:.6g} and "
+            f"[{j}, {i}] is {S[j, i]:.6g}"
+        )
+    S = 0.5 * (S + S.T)
+    least = float(np.linalg.eigvalsh(S)[0])
+    if least < -1e-9 * largest:
+        raise ValueError(
+            f"start_covariance must be positive semidefinite, but has the eigenvalue {least:.3g}"
+        )
+    return S
