@@ -158,7 +158,8 @@ class Iteration:
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
-        self._state_cost = "H_xx" in workspace.arrays and workspace.arrays["H_xx"].any
+        self.hopeless = 0
+        self._bent = False
 
     def run(self) -> Ending:
         """Iterate."""
@@ -205,24 +206,28 @@ class Iteration:
                 return Status.SOLVER_FAILED
             solved = time.perf_counter()
             trial = self._search(step, newton, fallback)
-            now = time.perf_counter()
-            stop = self._tell(step, trial, curved, now - clock - (solved - linearized),
-                              solved - linearized)  # fmt: skip
-            clock = now
             self.tried += 1
-            if not trial.accepted:
-                status = self._refused(newton, fallback)
-                if status is not None:
-                    return status
-            else:
+            shift, there, status = self.shift if curved else 0.0, 1 - self.side, None
+            if trial.accepted:
                 settling = trial.step * task.unit
-                radius = self.shift * self.shift * trial.radius if curved else 0.0
                 self._accepted(step, trial, newton)
-                length = trial.step + radius
+                # A short step that a shift made short proves nothing: the force it stands for,
+                # p¹ (x − x_k), must vanish too.
+                length = trial.step + shift * shift * trial.radius
                 short = trial.alpha == 1.0 and length + last <= task.tolerance
                 if short and not released and self._consistent():
-                    return Status.CONVERGED
+                    status = Status.CONVERGED
+                elif self.hopeless >= tuning.patience:
+                    status = Status.STALLED
                 last = length
+            else:
+                status = self._refused(newton, fallback)
+            now = time.perf_counter()
+            solving = solved - linearized
+            stop = self._tell(step, trial, shift, there, now - clock - solving, solving)
+            clock = now
+            if status is not None:
+                return status
             if stop:
                 return Status.STOPPED
         return Status.MAX_ITERATIONS
@@ -253,6 +258,7 @@ class Iteration:
         if not self.noisy:
             ws.kernel("weights")[side]()
             return
+        self._bend()
         ws.kernel("spread")[side]()
         ws.set(renewal=1.0 if fresh else self.renewal)
         ws.kernel("stakes")[side]()
@@ -283,13 +289,19 @@ class Iteration:
         ws.at(there, "u")[:] = inside
         moved = self._evaluated(there)
         if math.isfinite(sum(moved)):
-            self.side, self.at = there, moved
+            self.side, self.at, self._bent = there, moved, False
 
     def _prepare(self, curved: bool) -> None:
         """What the model needs beyond the point itself."""
         self._project()
-        if curved and self.filler is not None:
+        if curved:
+            self._bend()
+
+    def _bend(self) -> None:
+        """Second derivatives at the iterate, where they have to be filled in; once."""
+        if self.filler is not None and not self._bent:
             self.filler.second(self.workspace, self.side)
+            self._bent = True
 
     # ------------------------------------------------------------------------------- the step
 
@@ -349,7 +361,7 @@ class Iteration:
         predicted = gained + factor * lacking
         noise = tuning.noise * (1.0 + abs(before))
         most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
-        alpha = 1.0 if promise.length <= most else math.sqrt(most / promise.length)
+        alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
         ws, there = self.workspace, 1 - self.side
         shift = ws.kernel("shift")[self.side]
@@ -393,6 +405,9 @@ class Iteration:
         """Make the candidate the iterate; adapt shift and renewal."""
         tuning, unit = self.tuning, self.task.unit
         self.rejected = 0
+        cost = abs(trial.new.effort + trial.new.running + trial.new.penalty)
+        dear = step.model.dearest > tuning.dearest * (1.0 + cost)
+        self.hopeless = self.hopeless + 1 if newton and dear else 0
         if newton:
             least = tuning.first_shift * unit
             self.stale += 1
@@ -405,7 +420,7 @@ class Iteration:
                 self.floor, self.stale = max(tuning.shift_up * self.floor, 0.1 * least), 0
                 self.renewal = max(0.5 * self.renewal, tuning.least_renewal)
             self.shift = max(self._next_shift(trial), self.floor)
-        self.side, self.at = 1 - self.side, trial.new
+        self.side, self.at, self._bent = 1 - self.side, trial.new, False
         self._believe()
 
     def _next_shift(self, trial: _Trial) -> float:
@@ -427,21 +442,25 @@ class Iteration:
         return feasible and at.inconsistency <= tuning.consistency * size
 
     def _tell(
-        self, step: _Step, trial: _Trial, curved: bool, linearizing: float, solving: float
-    ) -> bool:
-        """Report the step; whether to stop."""
+        self, step: _Step, trial: _Trial, shift: float, there: int, linearizing: float,
+        solving: float,
+    ) -> bool:  # fmt: skip
+        """Report the step, whose trajectory is on a side of the workspace; whether to stop."""
         if self.watch is None:
             return False
         new, w = trial.new, self.task.variance_weight
+        variance = math.nan
+        if w > 0.0:  # of the belief, where it has followed
+            noise = self.workspace.view("noise")[0] if trial.accepted else new.charged - new.penalty
+            variance = noise / w
         row = StepTaken(
-            effort=new.effort, penalty=new.penalty, running=new.running,
-            variance=(new.charged - new.penalty) / w if w > 0.0 else math.nan,
+            effort=new.effort, penalty=new.penalty, running=new.running, variance=variance,
             merit=trial.merit, predicted=trial.predicted, actual=trial.actual, step=trial.step,
-            trust_radius=trial.radius, trust_multiplier=self.shift if curved else 0.0,
-            defect=new.defect, terminal_residual=new.residual, accepted=trial.accepted,
+            trust_radius=trial.radius, trust_multiplier=shift, defect=new.defect,
+            terminal_residual=new.residual, accepted=trial.accepted,
             solver_iterations=step.solves, linearize_seconds=linearizing, solve_seconds=solving,
         )  # fmt: skip
-        return bool(self.watch(row, 1 - self.side))
+        return bool(self.watch(row, there))
 
 
 class _Step(NamedTuple):

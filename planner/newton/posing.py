@@ -158,7 +158,13 @@ def _trace_of(model: Model, constraints: bool) -> Posed:
             if i:
                 known.insert(0, known.pop(i))
             return candidate
-    posed = _traced(model, constraints, named)
+    try:
+        posed = _traced(model, constraints, named)
+    except (TraceError, AttributeError):
+        return _traced(model, constraints, {})
+    if not _agrees(dataclasses.replace(posed, model=model), constraints):
+        # The numbers it names are not all, or are another's: a problem wrapped round one.
+        return _traced(model, constraints, {})
     # Without its model, lest the problem live for ever.
     known.insert(0, dataclasses.replace(posed, model=None))
     del known[_TRACES:]

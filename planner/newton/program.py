@@ -153,7 +153,8 @@ class Workspace:
     def at(self, side: int, name: str) -> Array:
         """An array of a point, (K + 1, ...) or (1, ...): what a kernel on that side calls `name`."""
         field = self.program.layout[name]
-        return self._sides[side][name].reshape(-1, *field.shape)
+        array = self._sides[side][name]
+        return array.reshape(len(array), *field.shape)
 
     def side(self, side: int) -> dict[str, Array]:
         """All arrays by the names that kernels on a side call them, rows flat."""

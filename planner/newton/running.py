@@ -140,6 +140,7 @@ class _Steps:
         self._workspace, self._callback = workspace, callback
         self._rows: list[StepTaken] = []
         self._points: list[tuple[Array, Array, Array]] = []
+        self._reported: list[Iteration] = []
 
     def watch(self, row: StepTaken, side: int) -> bool:
         """Keep a step whose trajectory is on a side of the workspace; True stops."""
@@ -153,10 +154,13 @@ class _Steps:
             mean=x, controls=u[:-1], terminal_multiplier=nu[0], virtual_control=0.0,
             **row._asdict(),
         )  # fmt: skip
+        self._reported.append(step)
         return bool(self._callback(step))
 
     def columns(self) -> Sequence[Iteration]:
         """The steps, put together when they are first looked at."""
+        if self._reported:
+            return tuple(self._reported)
         rows, points = self._rows, self._points
         return Columns(lambda: _columns(rows, points), len(rows)) if rows else ()
 

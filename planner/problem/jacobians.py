@@ -104,20 +104,18 @@ class Jacobians:
         graph, n, m = Graph(), self.n, 0 if name != "drift" else self.m
         t, x, u = graph.inputs("t", (1,)), graph.inputs("x", (1, n)), graph.inputs("u", (1, m))
         arguments = {"drift": (t, x, u), "terminal": (x,)}.get(name, (t, x))
-        value = np.asarray(trace_call(name, getattr(self.problem, name), *arguments))[0]
-        shape = value.shape
+        values = np.asarray(trace_call(name, getattr(self.problem, name), *arguments))
         if name == "state_cost":
-            by_x = jacobian(value.reshape(1), x[0])[0]
+            by_x = jacobian(values[:1], x[0])[0]
             parts = {"gradient": by_x, "hessian": jacobian(by_x, x[0])}
         else:
-            parts = {"x": jacobian(value, x[0])}
+            parts = {"x": jacobian(values[0], x[0])}
             if m:
-                parts["u"] = jacobian(value, u[0])
+                parts["u"] = jacobian(values[0], u[0])
         inputs = {"t": 1, "x": n, "u": m, "number": max(1, len(graph.numbers))}
         outputs = {key: [graph.lift(e) for e in part.ravel()] for key, part in parts.items()}
         function = numpy_function(inputs, outputs, frozenset({"number"}))
         numbers = np.array(graph.numbers or [0.0])[None]
-        del shape
 
         def slopes(t: Array, x: Array, u: Array) -> tuple[Array, ...]:
             lead = x.shape[:-1]

@@ -196,6 +196,17 @@ class Model:
         """(t, x) -> ℓ (..., m), or None."""
         return getattr(self.problem, "control_cost", None)
 
+    def constraint_count(self) -> int:
+        """Constraints of the problem; 0 without any.
+
+        Raises:
+            ValueError: if they have the wrong shape at the start, or are not finite there.
+        """
+        if not self.has("constraint"):
+            return 0
+        at = self.times[:2], np.stack([self.start, self.start])
+        return _answer(self.problem, "constraint", (2, None), *at).shape[1]
+
     def control_cost_jacobian(self, t: Array, x: Array) -> Array:
         """∂ℓ/∂x, (..., m, n)."""
         return self.jacobians.state("control_cost", t, x)

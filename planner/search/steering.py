@@ -136,12 +136,9 @@ class Request:
         if given is None and self.feedback:
             given = getattr(problem, "terminal_weight", None)
         spread = _SPREAD_WEIGHT if self.feedback else 0.0
-        constraints = 0
-        if model.has("constraint"):
-            constraints = np.shape(problem.constraint(model.times[:1], model.start[None]))[-1]
         return Stakes(
             penalties=model.weight,
-            constraints=constraints,
+            constraints=model.constraint_count(),
             price=0.0,
             terminal=np.full(q, spread) if given is None else _checked_terminal(given, q),
             soft=given is not None,

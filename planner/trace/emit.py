@@ -21,8 +21,8 @@ _COMPARISONS = {"greater": "ogt", "greater_equal": "oge", "equal": "oeq"}
 _INTRINSICS = {
     **{name: name for name in ("sin", "cos", "exp", "log", "sqrt", "floor", "exp2", "log2", "log10")},
     "abs": "fabs",
-    "minimum": "minnum",
-    "maximum": "maxnum",
+    "minimum": "minimum",
+    "maximum": "maximum",
 }  # fmt: skip
 #: NumPy's names where the C library's differ.
 _C_NAMES = {

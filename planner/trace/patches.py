@@ -24,6 +24,7 @@ from slipcar.planner.trace.arrays import TracedArray, graph_of
 from slipcar.planner.trace.graph import Expression
 from slipcar.planner.trace.ufuncs import erf
 
+_array = np.array
 _LOCK = threading.RLock()
 _TRACING = threading.local()
 _FLOATS = (None, float, np.float64, object, "float", "float64", "d", np.dtype(float), np.dtype("O"))
@@ -95,8 +96,10 @@ def _taking(original: Any) -> Any:
         if not _now():
             return original(*args, **kwargs)
         traced = graph_of((*args, *kwargs.values())) is not None
-        if traced and _is_floats(kwargs.get("dtype")):
+        if traced and kwargs.get("dtype") is not None and _is_floats(kwargs["dtype"]):
             kwargs["dtype"] = object
+        elif traced and original is _array and len(args) > 1 and _is_floats(args[1]):
+            args = (args[0], object, *args[2:])
         result = original(*args, **kwargs)
         if result.dtype.char == "d":
             return result.astype(object).view(TracedArray)

@@ -1,5 +1,6 @@
 """The paper's case with its reference, and tools that know the dynamics but not the planner."""
 
+import dataclasses
 import json
 import types
 from pathlib import Path
@@ -9,10 +10,10 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import plan
-from slipcar.planner.expected import loop
-from slipcar.planner.expected.guarded import posed
-from slipcar.planner.moments.stakes import Stakes
-from slipcar.planner.search.field import priced
+from slipcar.planner.newton.posing import pose
+from slipcar.planner.newton.running import solve_noise
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.search.steering import Request
 
 
 @pytest.fixture(scope="session")
@@ -65,45 +66,34 @@ def cost_of_controls():
 # ------------------------------------------------------------------------------ expected costs
 
 
-def _stakes_of(ready, *, price, soft, feedback, terminal=None, w=0.0, damping=0.5):
+def _stakes_of(problem, *, price, soft, feedback, terminal=None, w=0.0, renewal=0.5):
     """What to charge; the end at 100, or at `terminal`, if it is charged at all."""
-    guarded = ready.guarded
-    q = len(ready.model.terminal(ready.model.start))
+    model = model_of(problem)
     given = 100.0 if soft or feedback else 0.0
-    stakes = Stakes(
-        weight=guarded.penalty_weight,
-        tail=guarded.is_constraint,
+    stakes = Request(feedback=feedback, expected=True).stakes(model, w)
+    q = len(stakes.terminal)
+    return dataclasses.replace(
+        stakes,
+        price=price,
         terminal=np.full(q, given if terminal is None else terminal),
         soft=soft,
-        feedback=feedback,
-        variance_weight=w,
-        damping=damping,
+        renewal=renewal,
     )
-    return priced(stakes, price)
 
 
 def _nominal(problem):
     """A plan of the mean, where the iteration begins."""
-    found = plan(problem, variance_weight=0.0, compiled=False)
-    return found.mean, found.controls
+    p = plan(problem, variance_weight=0.0)
+    return p.mean, p.controls
 
 
-def _settle(problem, *, native=False, start=None, warm=None, tolerance=1e-14, limit=300, **asked):
+def _settle(problem, *, compiled=None, start=None, warm=None, tolerance=1e-14, limit=300, **asked):
     """(posed problem, stakes, answer)."""
-    ready = posed(problem)
-    stakes = _stakes_of(ready, **asked)
+    stakes = _stakes_of(problem, **asked)
+    posed = pose(model_of(problem), constraints=stakes.priced, compiled=compiled)
     x, u = _nominal(problem) if start is None else start
-    functions = ready.functions(x, u, native=native)
-    iterate = loop.iterate
-    if native:
-        from slipcar.planner.expected import run
-
-        assert functions.kernels is not None, functions.reason
-        iterate = run.iterate
-    found = iterate(
-        ready.model, functions, stakes, x, u, tolerance=tolerance, max_iterations=limit, warm=warm
-    )
-    return ready, stakes, found
+    answer = solve_noise(posed, stakes, x, u, tolerance=tolerance, max_iterations=limit, warm=warm)
+    return posed, stakes, answer
 
 
 def _mass(*, bounds=None, slip=0.4, walls=True, curved=True, additive=0.05, nodes=13, spread=0.0):
@@ -140,7 +130,7 @@ def _mass(*, bounds=None, slip=0.4, walls=True, curved=True, additive=0.05, node
 
 @pytest.fixture(scope="session")
 def expected_stakes():
-    """Stakes of a posed problem."""
+    """What is charged of a problem, by its keywords."""
     return _stakes_of
 
 

@@ -304,7 +304,7 @@ def test_what_cannot_be_traced_says_why():
         def drift(self, t, x, u):
             return np.where(x[..., :1] > 9.0, 0.0, super().drift(t, x, u))
 
-    pytest.importorskip("numba")
+    pytest.importorskip("llvmlite")
     assert plan(Branching()).status.ok
     with pytest.raises(ValueError, match="cannot be compiled: a comparison"):
         plan(Branching(), compiled=True)

@@ -201,18 +201,22 @@ def test_diffusion_must_have_a_row_for_each_state():
 
 
 @pytest.mark.filterwarnings("ignore::numpy.exceptions.ComplexWarning")
-def test_a_drift_that_casts_needs_its_jacobian():
+def test_a_cast_to_float_changes_nothing():
     def casts(t, x, u):
         return np.stack([x[..., 1], u[..., 0]], axis=-1).astype(np.float64)
 
-    refused("analytic Jacobian", Cart(drift=casts), TypeError)
-    A = np.array([[0.0, 1.0], [0.0, 0.0]])
-    B = np.array([[0.0], [1.0]])
+    p, plain = plan(Cart(drift=casts)), plan(Cart())
+    assert p.status is Status.CONVERGED
+    np.testing.assert_allclose(p.controls, plain.controls, atol=1e-9)
 
-    def jacobian(t, x, u):
-        return np.tile(A, (*x.shape[:-1], 1, 1)), np.tile(B, (*x.shape[:-1], 1, 1))
 
-    assert plan(Cart(drift=casts, drift_jacobian=jacobian)).status is Status.CONVERGED
+def test_a_drift_that_writes_into_its_argument():
+    def drift(t, x, u):
+        speed = x[..., 1].copy()
+        x[..., 1] *= 0.5
+        return np.stack([speed, u[..., 0]], axis=-1)
+
+    refused("wrote into its argument", Cart(drift=drift), ValueError)
 
 
 def test_a_drift_that_is_not_finite_along_the_guess():

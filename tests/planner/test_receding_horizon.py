@@ -12,7 +12,7 @@ from slipcar.evaluation import evaluate
 from slipcar.planner import OpenLoop, Status, plan
 from slipcar.planner.receding_horizon import RecedingHorizon
 
-PLAN = ("x", "u", "gains", "held", "adjoint")
+PLAN = ("x", "u", "gains", "eta", "adjoint")
 
 
 class Cart:
@@ -123,7 +123,7 @@ def test_without_noise_every_replan_is_the_rest_of_the_plan(paper):
 
 @pytest.mark.parametrize("price", [0.0, 30.0])
 def test_numpy_and_compiled_make_the_same_plans(paper, price):
-    pytest.importorskip("numba")
+    pytest.importorskip("llvmlite")
     one, other = (RecedingHorizon(paper, risk_price=price, compiled=c) for c in (True, False))
     obs = around(one, 4, seed=5)
     states = [c.predict(obs)[1] for c in (one, other)]

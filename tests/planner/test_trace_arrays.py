@@ -270,7 +270,8 @@ TRACED = {
     "inertia": _inertia,
     "a mass matrix": _mass,
     "inverse": lambda x: np.linalg.inv(W + x[..., None] * x[..., None, :] + 9 * np.eye(3)),
-    "inverse of a diagonal": lambda x: np.linalg.inv(np.diag([x[0, 0] + 9, 8.0, x[0, 1] + 9]) + 0.3),
+    "inverse of a diagonal": lambda x: np.linalg.inv(np.diag([x[0, 0], 8.0, x[0, 1] + 9]) + 0.3),
+    "array of floats": lambda x: np.array(x, float) + np.array(x[0], dtype=np.float64),
     "matrix-vector products": lambda x: (
         np.matvec(W, x) + np.vecdot(x, x) if hasattr(np, "matvec") else x
     ),

@@ -1,15 +1,11 @@
-"""Losses of a Gaussian row: against integrals, differences and what convexity promises."""
-
-import importlib.util
+"""Losses of rows, Gaussian or certain: against integrals, differences and what convexity promises."""
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from slipcar.planner.moments.losses import EDGE, deviations, loss
-
-needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs numba")
+from slipcar.planner.moments.losses import EDGE, deviations, hinge_loss, loss
 
 PENALTY, TAIL = np.array([False]), np.array([True])
 #: Mean in standard deviations: far below, around the edge and zero, far above.
@@ -22,8 +18,7 @@ SCALES = np.array([1e-3, 0.05, 1.0, 30.0])
 def at(c, s, kind, weight=1.0):
     """The four numbers of one row."""
     c, s = np.broadcast_arrays(np.asarray(c, float), np.asarray(s, float))
-    found = loss(c[..., None], s[..., None], np.array([weight]), kind)
-    return [v[..., 0] for v in (found.value, found.slope, found.curvature, found.by_variance)]
+    return [part[..., 0] for part in loss(c[..., None], s[..., None], np.array([weight]), kind)]
 
 
 # ------------------------------------------------------------------------------ values
@@ -35,8 +30,7 @@ def test_a_penalty_is_the_integral_of_its_square_against_the_density(s, t):
     c = t * s
     # In units of s, from where max(0, ·) begins.
     value, error = quad(lambda z: (t + z) ** 2 * norm.pdf(z), -t, max(-t, 0.0) + 40.0, epsabs=0)
-    (found,) = at([c], [s], PENALTY)[0:1]
-    assert found[0] == pytest.approx(s * s * value, rel=1e-7 + 10 * error)
+    assert at([c], [s], PENALTY)[0][0] == pytest.approx(s * s * value, rel=1e-7 + 10 * error)
 
 
 @pytest.mark.parametrize("s", SCALES)
@@ -145,24 +139,28 @@ def test_weights_multiply_each_row():
         np.testing.assert_allclose(getattr(many, name), weight * getattr(one, name))
 
 
-# ------------------------------------------------------------------------------ compiled
+# ------------------------------------------------------------------------------ certain rows
 
 
-@needs_numba
-@pytest.mark.parametrize("kind", [PENALTY, TAIL], ids=["penalty", "tail"])
-def test_the_compiled_row_is_the_same_function(kind):
-    # Interpreted: the same source that numba compiles, and no minute of compilation.
-    from slipcar.planner.expected.arrays import row_loss
+def test_a_certain_penalty_is_its_square_and_has_a_kink():
+    c = np.array([-2.0, -1e-9, 0.0, 1e-9, 0.3, 4.0])
+    value, slope, curvature, by_variance = hinge_loss(c)
+    positive = c > 0.0
+    np.testing.assert_array_equal(value, np.where(positive, c**2, 0.0))
+    np.testing.assert_array_equal(slope, np.where(positive, 2.0 * c, 0.0))
+    np.testing.assert_array_equal(curvature, np.where(positive, 2.0, 0.0))
+    np.testing.assert_array_equal(by_variance, 0.5 * curvature)  # the heat equation
 
-    for s in SCALES:
-        for t in RATIOS:
-            expected = [float(v) for v in at(t * s, s, kind)]
-            found = row_loss.py_func(t * s, s, bool(kind[0]))
-            # A difference of almost equal numbers below t = −6: what is lost there is worthless.
-            scale = 1e-14 * s * s if kind is PENALTY else 0.0
-            assert found[0] == pytest.approx(expected[0], rel=1e-9, abs=scale)
-            assert found[1] == pytest.approx(expected[1], rel=1e-8, abs=1e-14 * s)
-            assert found[2:] == pytest.approx(expected[2:], rel=1e-9, abs=1e-300)
+
+def test_a_gaussian_penalty_becomes_the_certain_one_as_its_spread_vanishes():
+    """E max(0, c)² − max(0, c̄)² is at most s²: between none and all of the variance."""
+    c = np.array([-0.2, -1e-3, 0.0, 1e-3, 0.5])
+    certain = hinge_loss(c)
+    for s in (1e-1, 1e-2, 1e-3):
+        more = at(c, s, PENALTY)[0] - certain.value
+        assert (more >= -1e-15).all()
+        assert (more <= s * s * (1.0 + 1e-9)).all()
+    np.testing.assert_allclose(at(c, 1e-9, PENALTY)[1], certain.slope, atol=2e-9)
 
 
 # ------------------------------------------------------------------------------ deviations
@@ -173,11 +171,11 @@ def test_deviations_are_those_of_a_linear_row_and_bounded_below():
     C, F = rng.normal(size=(6, 3, 4)), rng.normal(size=(6, 4, 4))
     S = F @ F.swapaxes(1, 2)
     S[0] = 0.0  # certain, as at the start
-    found = deviations(C, S)
+    s = deviations(C, S)
     for k in range(1, 6):
         for o in range(3):
-            assert found[k, o] ** 2 == pytest.approx(C[k, o] @ S[k] @ C[k, o])
-    assert (found[0] > 0.0).all()
-    np.testing.assert_allclose(found[0], 0.02 * found.max(axis=0), atol=2e-9)
+            assert s[k, o] ** 2 == pytest.approx(C[k, o] @ S[k] @ C[k, o])
+    assert (s[0] > 0.0).all()
+    np.testing.assert_allclose(s[0], 0.02 * s.max(axis=0), atol=2e-9)
     assert (deviations(C, np.zeros_like(S)) > 0.0).all()
     assert deviations(np.zeros((6, 0, 4)), S).shape == (6, 0)
