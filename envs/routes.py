@@ -39,8 +39,8 @@ def guesses(scenario: Task, count: int) -> list[tuple[str, Array, Array]]:
     """
     labels, paths = _one_of_each_class(scenario)
     found: dict[tuple[tuple[int, ...], int], tuple[float, str, Array, Array]] = {}
-    for label, path in zip(labels, paths, strict=True):
-        windings = homotopy_class(scenario, path)
+    classes = map(tuple, _windings(scenario, paths).tolist())
+    for label, path, windings in zip(labels, paths, classes, strict=True):
         for half_turns in _nearest_half_turns(scenario, path, 2):
             x, u = trajectory(scenario, path, half_turns)
             power = np.sum(scenario.control_power(u)) + np.sum(scenario.obstacle_power(x[1:]))

@@ -67,7 +67,7 @@ def closed_loop_covariance(
 
 def feedback_effort(R: Array, dt: Array, gains: Array, S: Array) -> float:
     """Σ dt tr(K Σ Kᵀ R), the effort of the corrections; gains (K, m, n), Σ (N, n, n)."""
-    return float(np.einsum("k,kmi,kij,klj,lm", dt, gains, S[:-1], gains, R, optimize=True))
+    return float(np.vdot(dt[:, None, None] * (R @ gains), gains @ S[:-1]))
 
 
 def wrap(error: Array, angles: Iterable[int]) -> Array:

@@ -46,36 +46,21 @@ Array = np.ndarray
 Rows = Any  # SymbolRows or NumberRows
 
 
-class Knobs(NamedTuple):
-    """What the iteration tells its kernels, a row of numbers.
-
-    Attributes:
-        alpha: length of the step that `shift` takes.
-        damping: multiple of the identity that makes the model convex.
-        kappa: weight of ½ ‖G d + g‖², zero at a solution.
-        hinges: 0 leaves the rows out.
-        curved: 1 with the curvature of dynamics, rows and end.
-        clipped: 1 clips the controls to their bounds before the states follow.
-        softness: of the terminal condition's system.
-        stiffness: of the bounds that are held.
-        variance_weight: w.
-        closed: 1 with feedback.
-        saturation: bounds are kept at so many standard deviations of the correction.
-        renewal: the part of a change of rows' weights that is taken over, in (0, 1].
-    """
-
-    alpha: float = 0.0
-    damping: float = 0.0
-    kappa: float = 0.0
-    hinges: float = 1.0
-    curved: float = 0.0
-    clipped: float = 0.0
-    softness: float = 0.0
-    stiffness: float = 0.0
-    variance_weight: float = 0.0
-    closed: float = 0.0
-    saturation: float = 1.0
-    renewal: float = 1.0
+#: What the iteration tells its kernels, entries of the row `knob`:
+KNOBS = (
+    "alpha",  # length of the step that `shift` takes
+    "damping",  # multiple of the identity that makes the model convex
+    "kappa",  # weight of ½ ‖G d + g‖², zero at a solution
+    "hinges",  # 0 leaves the rows out
+    "curved",  # 1 with the curvature of dynamics, rows and end
+    "clipped",  # 1 clips the controls to their bounds before the states follow
+    "softness",  # of the terminal condition's system
+    "stiffness",  # of the bounds that are held
+    "variance_weight",  # w
+    "closed",  # 1 with feedback
+    "saturation",  # bounds are kept at so many standard deviations of the correction
+    "renewal",  # the part of a change of rows' weights that is taken over, in (0, 1]
+)
 
 
 class Evaluation(NamedTuple):
@@ -188,7 +173,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "H_xx": Field((n, n)), **own,
     }  # fmt: skip
     fields = {
-        "number": Field((dims.numbers,), True), "knob": Field((len(Knobs._fields),), True),
+        "number": Field((dims.numbers,), True), "knob": Field((len(KNOBS),), True),
         "R": Field((m, m), True), "R_inverse": Field((m, m), True), "weight": Field((p,), True),
         "t": Field(()), "dt": Field(()), "dn": Field(()), "lower": Field((m,)),
         "upper": Field((m,)), **point, **{name + NEW: field for name, field in point.items()},
@@ -588,4 +573,4 @@ class Equations:
         rows.write("noise", carried["noise"] + np.sum(carried["P"] * rows["Sigma"]))
 
     def _knob(self, rows: Rows, name: str) -> Any:
-        return rows["knob"][Knobs._fields.index(name)]
+        return rows["knob"][KNOBS.index(name)]

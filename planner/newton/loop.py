@@ -39,13 +39,21 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from slipcar.planner.newton.equations import Evaluation, Model, Promise
+from slipcar.planner.newton.equations import KNOBS, Evaluation, Model, Promise
+from slipcar.planner.lq.riccati import SOFTNESS
 from slipcar.planner.newton.program import Workspace
 from slipcar.planner.newton.tuning import Tuning
 from slipcar.planner.problem.linearization import nearest_semidefinite
 from slipcar.planner.status import Status
 
 Array = np.ndarray
+
+_ALPHA, _DAMPING, _KAPPA, _HINGES, _CURVED, _CLIPPED, _SOFTNESS, _RENEWAL = (
+    KNOBS.index(name)
+    for name in (
+        "alpha", "damping", "kappa", "hinges", "curved", "clipped", "softness", "renewal",
+    )
+)  # fmt: skip
 
 
 class Task(NamedTuple):
@@ -56,6 +64,8 @@ class Task(NamedTuple):
         max_iterations: at most so many steps.
         unit: of a shift, the largest diagonal entry of R.
         longest_dt: the longest interval.
+        bounded: whether there are bounds of the controls.
+        state_cost: whether there is a state cost, whose Hessian may need a projection.
         released: leave the rows out at first.
         variance_weight: w.
         feedback: plan gains.
@@ -67,6 +77,8 @@ class Task(NamedTuple):
     max_iterations: int
     unit: float
     longest_dt: float
+    bounded: bool
+    state_cost: bool
     released: bool = False
     variance_weight: float = 0.0
     feedback: bool = False
@@ -151,10 +163,9 @@ class Iteration:
         form = workspace.program.form
         self.noisy, self.exact = form.noisy, not form.soft
         self.charged = self.noisy or task.variance_weight > 0.0
-        self.bounded = bool(
-            np.isfinite(workspace.arrays["lower"]).any()
-            or np.isfinite(workspace.arrays["upper"]).any()
-        )
+        self._evaluate, self._shift = workspace.kernels["evaluate"], workspace.kernels["shift"]
+        self._backward, self._forward = workspace.kernels["backward"], workspace.kernels["forward"]
+        self._knobs = workspace.knobs
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
@@ -164,11 +175,11 @@ class Iteration:
     def run(self) -> Ending:
         """Iterate."""
         ws, task, tuning = self.workspace, self.task, self.tuning
-        ws.set(
-            hinges=1.0, curved=0.0, clipped=0.0, variance_weight=task.variance_weight,
-            closed=1.0 if task.feedback else 0.0, saturation=task.saturation,
-            stiffness=tuning.bound_stiffness * 2.0 * task.longest_dt * task.unit,
-        )  # fmt: skip
+        ws.arrays["knob"][0] = [{
+            "hinges": 1.0, "variance_weight": task.variance_weight,
+            "closed": 1.0 if task.feedback else 0.0, "saturation": task.saturation,
+            "stiffness": tuning.bound_stiffness * 2.0 * task.longest_dt * task.unit,
+        }.get(name, 0.0) for name in KNOBS]  # fmt: skip
         self.at = self._evaluated(0)
         if not math.isfinite(sum(self.at)):
             return Ending(None, 0, 0, self.at)
@@ -197,7 +208,7 @@ class Iteration:
             )
             fallback = tuning.falls_back and self.rejected >= tuning.rejections
             curved = newton and not fallback
-            if self.noisy and self.bounded:
+            if self.noisy and task.bounded:
                 self._confine()
             self._prepare(curved)
             linearized = time.perf_counter()
@@ -237,14 +248,15 @@ class Iteration:
     def _evaluated(self, side: int) -> Evaluation:
         if self.filler is not None:
             self.filler.point(self.workspace, side)
-        self.workspace.kernel("evaluate")[side]()
-        return Evaluation._make(self.workspace.view("evaluated"))
+        self._evaluate[side]()
+        evaluation: Evaluation = self.workspace.evaluation()
+        return evaluation
 
     def _measure_end(self) -> None:
         """How far controls of unit cost move the end: scales of the terminal condition."""
         ws, self.gramian, self.kappa = self.workspace, 0.0, 0.0
         if self.exact:
-            ws.kernel("gramian")[0]()
+            ws.kernels["gramian"][0]()
             self.gramian = ws.view("gramian")[0]
         if self.gramian > 0.0:
             self.kappa = self.tuning.terminal_curvature * ws.program.dims.q / self.gramian
@@ -256,22 +268,21 @@ class Iteration:
         ws, side = self.workspace, self.side
         self._project()
         if not self.noisy:
-            ws.kernel("weights")[side]()
+            ws.kernels["weights"][side]()
             return
         self._bend()
-        ws.kernel("spread")[side]()
-        ws.set(renewal=1.0 if fresh else self.renewal)
-        ws.kernel("stakes")[side]()
-        ws.kernel("weights")[side]()
+        ws.kernels["spread"][side]()
+        self._knobs[_RENEWAL] = 1.0 if fresh else self.renewal
+        ws.kernels["stakes"][side]()
+        ws.kernels["weights"][side]()
         if self.task.feedback:
-            ws.kernel("spread")[side]()
+            ws.kernels["spread"][side]()
 
     def _project(self) -> None:
         """The nearest semidefinite Hessian of the state cost, where there is one."""
-        ws = self.workspace
-        H = ws.at(self.side, "H_xx")
-        if H.any():
-            ws.at(self.side, "H_psd")[:] = nearest_semidefinite(H)
+        if self.task.state_cost:
+            ws, side = self.workspace, self.side
+            ws.at(side, "H_psd")[:] = nearest_semidefinite(ws.at(side, "H_xx"))
 
     def _confine(self) -> None:
         """Bring the controls within the bounds that the gains of now leave.
@@ -307,15 +318,13 @@ class Iteration:
 
     def _step(self, curved: bool, released: bool) -> _Step | None:
         """The model's step: bounds settle, and the shift grows until the model is convex."""
-        ws, tuning, gramian = self.workspace, self.tuning, self.gramian
+        knobs, tuning, gramian = self._knobs, self.tuning, self.gramian
         kappa = self.kappa if curved else 0.0
-        ws.set(
-            hinges=0.0 if released else 1.0, curved=1.0 if curved else 0.0, kappa=kappa,
-            softness=1e-13 * gramian / (1.0 + kappa * gramian), clipped=0.0,
-        )  # fmt: skip
+        knobs[_HINGES], knobs[_CURVED] = 0.0 if released else 1.0, 1.0 if curved else 0.0
+        knobs[_KAPPA], knobs[_SOFTNESS] = kappa, SOFTNESS * gramian / (1.0 + kappa * gramian)
         solves = 0
         for _ in range(tuning.inertia_trials):
-            ws.set(damping=self.shift if curved else 0.0)
+            knobs[_DAMPING] = self.shift if curved else 0.0
             model, promise, rounds = self._settle_bounds()
             solves += rounds
             if promise is not None:
@@ -327,16 +336,15 @@ class Iteration:
 
     def _settle_bounds(self) -> tuple[Model, Promise | None, int]:
         """Solve the LQ problem until the bounds it passes are those it was solved with."""
-        ws, side, rounds = self.workspace, self.side, self.tuning.bound_rounds
-        backward, forward = ws.kernel("backward")[side], ws.kernel("forward")[side]
-        modelled, promised = ws.view("modelled"), ws.view("promised")
+        ws, rounds = self.workspace, self.tuning.bound_rounds
+        backward, forward = self._backward[self.side], self._forward[self.side]
         for attempt in range(1, rounds + 1):
             backward()
-            model = Model._make(modelled)
+            model: Model = ws.model()
             if model.bad != 0.0:
                 return model, None, attempt
             forward()
-            promise = Promise._make(promised)
+            promise: Promise = ws.promise()
             if not math.isfinite(promise.total):
                 return model, None, attempt
             if promise.changed == 0.0:
@@ -344,15 +352,14 @@ class Iteration:
             if attempt < rounds:
                 ws.arrays["held"][:] = ws.arrays["passed"]
         # The set does not settle: clip the controls and let the states follow.
-        ws.set(clipped=1.0)
+        self._knobs[_CLIPPED] = 1.0
         forward()
-        ws.set(clipped=0.0)
-        return model, Promise._make(promised), rounds
+        self._knobs[_CLIPPED] = 0.0
+        return model, ws.promise(), rounds
 
     def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
-        model, promise, tuning = step
-        tuning, at = self.tuning, self.at
+        model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
         price, dear = 0.5 * promise.price, 0.5 * model.dearest
         lacking = price * promise.gap + dear * promise.miss
         gained = promise.pull - promise.change
@@ -363,11 +370,10 @@ class Iteration:
         most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
-        ws, there = self.workspace, 1 - self.side
-        shift = ws.kernel("shift")[self.side]
+        there = 1 - self.side
         for trial in range(trials):
-            ws.set(alpha=alpha)
-            shift()
+            self._knobs[_ALPHA] = alpha
+            self._shift[self.side]()
             new = self._evaluated(there)
             merit = new.effort + new.running + new.charged + new.pull
             merit += factor * (price * new.gap + dear * new.miss)
@@ -454,11 +460,9 @@ class Iteration:
             noise = self.workspace.view("noise")[0] if trial.accepted else new.charged - new.penalty
             variance = noise / w
         row = StepTaken(
-            effort=new.effort, penalty=new.penalty, running=new.running, variance=variance,
-            merit=trial.merit, predicted=trial.predicted, actual=trial.actual, step=trial.step,
-            trust_radius=trial.radius, trust_multiplier=shift, defect=new.defect,
-            terminal_residual=new.residual, accepted=trial.accepted,
-            solver_iterations=step.solves, linearize_seconds=linearizing, solve_seconds=solving,
+            new.effort, new.penalty, new.running, variance, trial.merit, trial.predicted,
+            trial.actual, trial.step, trial.radius, shift, new.defect, new.residual,
+            trial.accepted, step.solves, linearizing, solving,
         )  # fmt: skip
         return bool(self.watch(row, there))
 

@@ -18,7 +18,7 @@ from slipcar.planner.moments.losses import deviations
 from slipcar.planner.newton.equations import Form
 from slipcar.planner.newton.filling import ModelFiller, TracedFiller
 from slipcar.planner.newton.loop import Filler
-from slipcar.planner.newton.program import Program, compilable, program_of
+from slipcar.planner.newton.program import Probe, Program, compilable, program_of
 from slipcar.planner.newton.quantities import Dimensions, Filled, Traced
 from slipcar.planner.problem import checks
 from slipcar.planner.problem.integrators import change
@@ -58,6 +58,13 @@ class Posed:
     tails: int
     native: bool
     reason: str = ""
+
+    def of(self, model: Model | None, **changes: Any) -> Posed:
+        """The same for a model that differs in numbers only."""
+        copy = object.__new__(Posed)
+        vars(copy).update(vars(self), model=model, **changes)
+        vars(copy).pop("filler", None)
+        return copy
 
     def program(self, form: Form) -> Program:
         """The kernels of a form of the equations."""
@@ -119,7 +126,7 @@ def pose(model: Model, *, constraints: bool = False, compiled: bool | None = Non
     if compiled is None and not native:
         machine_code.tell_once("llvmlite is missing: plans take some hundred times longer")
     try:
-        traced = _trace_of(model, constraints)
+        traced = _trace_of(model, constraints, native)
     except TraceError as error:
         if compiled:
             raise ValueError(
@@ -129,7 +136,7 @@ def pose(model: Model, *, constraints: bool = False, compiled: bool | None = Non
         return _untraced(model, constraints, native, str(error))
     tails = traced.problem.dims.p - len(model.weight)
     native = native and compilable(traced.problem.dims)
-    return dataclasses.replace(traced, model=model, tails=tails, native=native)
+    return traced.of(model, tails=tails, native=native)
 
 
 # ------------------------------------------------------------------------------------ tracing
@@ -138,7 +145,7 @@ def pose(model: Model, *, constraints: bool = False, compiled: bool | None = Non
 _kinds: dict[Any, list[Posed]] = {}
 
 
-def _trace_of(model: Model, constraints: bool) -> Posed:
+def _trace_of(model: Model, constraints: bool, native: bool) -> Posed:
     """A known trace of the kind that agrees with the problem now, or a new one."""
     named = _parameters(model.problem)
     if named is None:
@@ -153,8 +160,8 @@ def _trace_of(model: Model, constraints: bool) -> Posed:
     count = sum(len(value) for value in own)
     for i, posed in enumerate(known):
         numbers = np.concatenate([*own, posed.numbers[count:]])
-        candidate = dataclasses.replace(posed, model=model, numbers=numbers)
-        if _agrees(candidate, constraints):
+        candidate = posed.of(model, numbers=numbers)
+        if _agrees(candidate, constraints, native):
             if i:
                 known.insert(0, known.pop(i))
             return candidate
@@ -162,11 +169,11 @@ def _trace_of(model: Model, constraints: bool) -> Posed:
         posed = _traced(model, constraints, named)
     except (TraceError, AttributeError):
         return _traced(model, constraints, {})
-    if not _agrees(dataclasses.replace(posed, model=model), constraints):
+    if not _agrees(posed, constraints, native):
         # The numbers it names are not all, or are another's: a problem wrapped round one.
         return _traced(model, constraints, {})
     # Without its model, lest the problem live for ever.
-    known.insert(0, dataclasses.replace(posed, model=None))
+    known.insert(0, posed.of(None))
     del known[_TRACES:]
     return posed
 
@@ -287,7 +294,7 @@ def _facts(traced: Traced, b: Array) -> checks.Facts:
     )
 
 
-def _agrees(posed: Posed, constraints: bool) -> bool:
+def _agrees(posed: Posed, constraints: bool, native: bool) -> bool:
     """Whether a known trace says what the problem's functions say, at a few points."""
     model, problem = posed.model, posed.problem
     assert isinstance(problem, Traced)
@@ -296,13 +303,21 @@ def _agrees(posed: Posed, constraints: bool) -> bool:
         given = _called(model, constraints, t, x, u)
     except (ValueError, TypeError, IndexError):
         return False
-    if given is None or given.shape[1] != problem.width:
+    if given.shape[1] != len(problem.entries):
         return False
-    traced = problem.values(t=t, dt=np.full(_PROBES, model.dt[0]), x=x, u=u, number=posed.numbers)
+    values = problem.values
+    if native:
+        known = problem.programs
+        if "probe" not in known:
+            known["probe"] = Probe(problem, posed.structure, _PROBES)
+        values = known["probe"]
+    traced = values(t, float(model.dt[0]), x, u, posed.numbers)
+    off = np.abs(traced - given)
     size = np.abs(given)
-    with np.errstate(all="ignore"):
-        near = np.abs(traced - given) <= _AGREEMENT * (size + size.max(axis=1, keepdims=True))
-    return bool((near | (np.isnan(traced) & np.isnan(given)) | (traced == given)).all())
+    if (off <= _AGREEMENT * (size + size.max())).all():
+        return True
+    same = (np.isnan(traced) & np.isnan(given)) | (traced == given)
+    return bool((same | (off <= _AGREEMENT * (size + size.max(axis=1, keepdims=True)))).all())
 
 
 @functools.lru_cache(maxsize=64)
@@ -318,7 +333,7 @@ def _probe_points(model: Model) -> tuple[Array, Array, Array]:
     return model.times[:_PROBES], x, noise[1]
 
 
-def _called(model: Model, constraints: bool, t: Array, x: Array, u: Array) -> Array | None:
+def _called(model: Model, constraints: bool, t: Array, x: Array, u: Array) -> Array:
     """The problem's functions at some points, in the order of `Traced.values`."""
     problem: Any = model.problem
     dt = np.full(len(t), model.dt[0])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import struct
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -16,10 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.newton.equations import NEW, Equations, Form, Knobs, layout
+from slipcar.planner.newton.equations import (
+    NEW,
+    Equations,
+    Evaluation,
+    Form,
+    Model,
+    Promise,
+    layout,
+)
 from slipcar.planner.newton.quantities import Dimensions, Filled, Traced
 from slipcar.planner.trace import emit, machine_code
-from slipcar.planner.trace.recursion import Layout, Recursion, in_numpy
+from slipcar.planner.trace.recursion import Field, Layout, Recursion, in_numpy
 
 Array = np.ndarray
 #: Programs kept in a process; each is some hundred kilobytes.
@@ -113,6 +122,52 @@ def _estimate(dims: Dimensions) -> str:
     return f"compiling for {dims.n} states and {dims.m} controls, some {seconds:.0f} s (once) ..."
 
 
+#: What a trajectory is, in the order of `Workspace.trajectories`.
+TRAJECTORY = ("x", "u", "nu")
+
+
+class Probe:
+    """A traced problem's functions at a few points, as machine code.
+
+    Args:
+        problem: its expressions.
+        structure: what tells kinds apart.
+        count: points.
+    """
+
+    def __init__(self, problem: Traced, structure: bytes, count: int) -> None:
+        dims, entries = problem.dims, problem.entries
+        self._layout = {
+            "t": Field(()), "dt": Field(()), "x": Field((dims.n,)), "u": Field((dims.m,)),
+            "number": Field((dims.numbers,), True), "values": Field((len(entries),)),
+        }  # fmt: skip
+
+        def step(rows: Any, carried: dict[str, Any]) -> dict[str, Any]:
+            rows.write("values", np.array(entries, dtype=object))
+            return {}
+
+        recursion = Recursion("probe", step, lambda rows: {})
+        key = repr(("probe", structure, dims)).encode()
+        assembly = functools.partial(emit.module, [recursion], problem.graph, self._layout, {})
+        self._code = machine_code.code(key, ["probe"], assembly)
+        self._arrays = {
+            name: np.zeros((1 if field.single else count, field.width))
+            for name, field in self._layout.items()
+        }
+        table = [array.ctypes.data for array in self._arrays.values()]
+        self._table, self._count = np.array(table, dtype=np.int64), count
+        self._lock = threading.Lock()
+
+    def __call__(self, t: Array, dt: float, x: Array, u: Array, number: Array) -> Array:
+        """Values at times (count,), states (count, n), controls (count, m): (count, width)."""
+        arrays = self._arrays
+        with self._lock:
+            arrays["t"][:, 0], arrays["dt"][:, 0] = t, dt
+            arrays["x"][:], arrays["u"][:], arrays["number"][0] = x, u, number
+            self._code.functions["probe"](self._count, self._table.ctypes.data)
+            return arrays["values"].copy()
+
+
 class Workspace:
     """Arrays of a program for K intervals, and its kernels on either side.
 
@@ -120,6 +175,12 @@ class Workspace:
         program: what runs.
         K: intervals.
         arrays: by name, (K + 1, width) or (1, width) each.
+        trajectories: x, u and ν of either side, one after the other.
+        knobs: the numbers of :class:`.equations.Knobs`.
+        kernels: each on either side, by name.
+        evaluation: reads what `evaluate` said.
+        model: reads what `backward` said.
+        promise: reads what `forward` said.
     """
 
     def __init__(self, program: Program, K: int) -> None:
@@ -128,6 +189,7 @@ class Workspace:
             name: np.zeros((1 if field.single else K + 1, field.width))
             for name, field in program.layout.items()
         }
+        self.trajectories = (self._together(""), self._together(NEW))
         swapped = [
             {name: self.arrays[_other(name, program.layout) if side else name]
              for name in program.layout}
@@ -138,13 +200,21 @@ class Workspace:
             np.array([a.ctypes.data for a in side.values()], dtype=np.int64) for side in swapped
         ]
         self.knobs = memoryview(self.arrays["knob"].reshape(-1))
-        self._kernels: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {
+        self.kernels: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {
             name: (self._bound(name, 0), self._bound(name, 1)) for name in program.recursions
         }
+        self.evaluation = self._reader("evaluated", Evaluation)
+        self.model = self._reader("modelled", Model)
+        self.promise = self._reader("promised", Promise)
 
-    def kernel(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
-        """A kernel on either side."""
-        return self._kernels[name]
+    def _together(self, suffix: str) -> Array:
+        """Put a point's x, u and ν side by side, so that one copy keeps them all."""
+        names = [name + suffix for name in TRAJECTORY]
+        sizes = [self.arrays[name].size for name in names]
+        whole, ends = np.zeros(sum(sizes)), np.cumsum(sizes)
+        for name, size, end in zip(names, sizes, ends, strict=True):
+            self.arrays[name] = whole[end - size : end].reshape(self.arrays[name].shape)
+        return whole
 
     def view(self, name: str) -> memoryview:
         """The numbers of an array that has one row."""
@@ -156,14 +226,21 @@ class Workspace:
         array = self._sides[side][name]
         return array.reshape(len(array), *field.shape)
 
-    def side(self, side: int) -> dict[str, Array]:
-        """All arrays by the names that kernels on a side call them, rows flat."""
-        return self._sides[side]
+    def trajectory(self, flat: Array) -> tuple[Array, Array, Array]:
+        """x (N, n), u (K, m) and ν (q,) of a copy of one of the `trajectories`."""
+        shapes = [self.arrays[name].shape for name in TRAJECTORY]
+        ends = np.cumsum([rows * width for rows, width in shapes])
+        x, u, nu = (
+            part.reshape(shape)
+            for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)
+        )
+        return x, u[:-1], nu[0]
 
-    def set(self, **knobs: float) -> None:
-        """Turn knobs."""
-        for name, value in knobs.items():
-            self.knobs[_KNOB[name]] = value
+    def _reader(self, name: str, record: Any) -> Callable[[], Any]:
+        """A function that reads a row of numbers as a record."""
+        buffer, new = self.view(name), tuple.__new__
+        unpack = struct.Struct(f"{len(buffer)}d").unpack_from
+        return lambda: new(record, unpack(buffer))
 
     def _bound(self, name: str, side: int) -> Callable[[], None]:
         program = self.program
@@ -172,9 +249,6 @@ class Workspace:
             return functools.partial(in_numpy, recursion, program.layout, self._sides[side], self.K)
         function = program.code.functions[name]
         return functools.partial(function, self.K, self._tables[side].ctypes.data)
-
-
-_KNOB = {name: i for i, name in enumerate(Knobs._fields)}
 
 
 def _other(name: str, fields: Layout) -> str:

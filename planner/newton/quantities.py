@@ -96,35 +96,25 @@ class Traced:
         )  # fmt: skip
 
     @functools.cached_property
-    def _rows(self) -> dict[str, list[Expression]]:
-        """What it says at a point, as it is compared with what the problem's functions say."""
+    def entries(self) -> list[Expression]:
+        """x⁺, σ, ℓ, c, H and g in one row, as the problem's functions are called."""
         parts = [self.next, self.sigma, self.c, self.g]
-        parts.insert(2, self.ell if self._own_ell else self.ell[:0])
+        if any(not e.is_zero for e in self.ell):
+            parts.insert(2, self.ell)
         if self.state_cost:
-            parts.insert(4, np.array([self.H], dtype=object))
-        return {"values": [self.graph.lift(e) for part in parts for e in np.ravel(part)]}
+            parts.insert(-1, np.array([self.H], dtype=object))
+        return [self.graph.lift(e) for part in parts for e in np.ravel(part)]
+
+    def values(self, t: Array, dt: float, x: Array, u: Array, number: Array) -> Array:
+        """`entries` at times (k,), states (k, n) and controls (k, m), in NumPy: (k, width)."""
+        dts = np.full((len(x), 1), dt)
+        return self._value_function(t=t[:, None], dt=dts, x=x, u=u, number=number[None])["values"]
 
     @functools.cached_property
-    def _own_ell(self) -> bool:
-        return any(not e.is_zero for e in self.ell)
-
-    @property
-    def width(self) -> int:
-        """Of the rows of :meth:`values`."""
-        return len(self._rows["values"])
-
-    @functools.cached_property
-    def values(self) -> Callable[..., Array]:
-        """x⁺, σ, ℓ, c, H and g at points: t, dt (k,), x (k, n), u (k, m), number -> (k, width)."""
+    def _value_function(self) -> Callable[..., dict[str, Array]]:
         dims = self.dims
         inputs = {"t": 1, "dt": 1, "x": dims.n, "u": dims.m, "number": dims.numbers}
-        function = numpy_function(inputs, self._rows, frozenset({"number"}))
-
-        def call(t: Array, dt: Array, x: Array, u: Array, number: Array) -> Array:
-            arrays = {"t": t[:, None], "dt": dt[:, None], "x": x, "u": u, "number": number[None]}
-            return function(**arrays)["values"]
-
-        return call
+        return numpy_function(inputs, {"values": self.entries}, frozenset({"number"}))
 
     def rows(self, t: Array, x: Array, number: Array) -> tuple[Array, Array, Array]:
         """C (K, p), ∂c/∂x (K, p, n) and ∂²c/∂x² (K, p, n, n) at times (K,), states (K, n)."""

@@ -90,7 +90,8 @@ def solve_mean(
     load(workspace, posed, model.weight, x, u)
     task = Task(
         tolerance=options.tolerance, max_iterations=options.max_iterations, unit=model.unit,
-        longest_dt=model.longest_dt, released=free_first and len(model.weight) > 0,
+        longest_dt=model.longest_dt, bounded=model.bounded, state_cost=model.has("state_cost"),
+        released=free_first and len(model.weight) > 0,
         variance_weight=w,
     )  # fmt: skip
     steps = _Steps(workspace, options.callback) if history or options.callback else None
@@ -107,7 +108,7 @@ def _outcome(
 ) -> Outcome:
     side, at, K = ending.side, ending.at, workspace.K
     assert ending.status is not None
-    workspace.kernel("spread")[side]()
+    workspace.kernels["spread"][side]()
     S = workspace.at(side, "Sigma").copy()
     objective = at.effort + at.penalty + at.running
     if w > 0.0:
@@ -139,21 +140,19 @@ class _Steps:
     ) -> None:
         self._workspace, self._callback = workspace, callback
         self._rows: list[StepTaken] = []
-        self._points: list[tuple[Array, Array, Array]] = []
+        self._points: list[Array] = []
         self._reported: list[Iteration] = []
 
     def watch(self, row: StepTaken, side: int) -> bool:
         """Keep a step whose trajectory is on a side of the workspace; True stops."""
-        arrays = self._workspace.side(side)
         self._rows.append(row)
-        self._points.append((arrays["x"].copy(), arrays["u"].copy(), arrays["nu"].copy()))
+        self._points.append(self._workspace.trajectories[side].copy())
         if self._callback is None:
             return False
-        x, u, nu = self._points[-1]
+        x, u, nu = self._workspace.trajectory(self._points[-1])
         step = Iteration(
-            mean=x, controls=u[:-1], terminal_multiplier=nu[0], virtual_control=0.0,
-            **row._asdict(),
-        )  # fmt: skip
+            mean=x, controls=u, terminal_multiplier=nu, virtual_control=0.0, **row._asdict()
+        )
         self._reported.append(step)
         return bool(self._callback(step))
 
@@ -161,18 +160,16 @@ class _Steps:
         """The steps, put together when they are first looked at."""
         if self._reported:
             return tuple(self._reported)
-        rows, points = self._rows, self._points
-        return Columns(lambda: _columns(rows, points), len(rows)) if rows else ()
+        rows, points, split = self._rows, self._points, self._workspace.trajectory
+        return Columns(lambda: _columns(rows, [split(p) for p in points]), len(rows)) if rows else ()
 
 
 def _columns(rows: list[StepTaken], points: list[tuple[Array, Array, Array]]) -> dict[str, Array]:
-    columns: dict[str, Array] = {
-        name: np.array(values) for name, values in zip(StepTaken._fields, zip(*rows, strict=True), strict=True)
-    }  # fmt: skip
+    columns = dict(zip(StepTaken._fields, map(np.array, zip(*rows, strict=True)), strict=True))
     x, u, nu = (np.stack(parts) for parts in zip(*points, strict=True))
+    none = np.zeros(len(rows))
     return columns | {
-        "mean": x, "controls": u[:, :-1], "terminal_multiplier": nu[:, 0],
-        "virtual_control": np.zeros(len(rows)),
+        "mean": x, "controls": u, "terminal_multiplier": nu, "virtual_control": none,
     }  # fmt: skip
 
 
@@ -236,7 +233,8 @@ def task_of(
     """What an iteration on an expected cost is asked for."""
     return Task(
         tolerance=tolerance, max_iterations=max_iterations, unit=model.unit,
-        longest_dt=model.longest_dt, variance_weight=stakes.variance_weight,
+        longest_dt=model.longest_dt, bounded=model.bounded, state_cost=model.has("state_cost"),
+        variance_weight=stakes.variance_weight,
         feedback=stakes.feedback, saturation=stakes.saturation, warm=warm,
     )  # fmt: skip
 

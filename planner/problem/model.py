@@ -301,7 +301,10 @@ def _checked(problem: Any) -> Model:
         radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
         weight=np.zeros(0),
     )
-    return dataclasses.replace(model, weight=_checked_functions(model))
+    model = dataclasses.replace(model, weight=_checked_functions(model))
+    for name in ("state_dim", "control_dim", "bounded", "R_inverse", "unit", "longest_dt"):
+        getattr(model, name)  # once, for all copies of it
+    return model
 
 
 def _checked_functions(model: Model) -> Array:

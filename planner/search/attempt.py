@@ -64,7 +64,7 @@ def attempt(
     if posed is None:
         return _convex(model, options, x, u, free_first)
     if posed.model is not model:
-        posed = dataclasses.replace(posed, model=model)
+        posed = posed.of(model)
     limited = _newton_options(options)
     outcome = solve_mean(posed, limited, x, u, free_first=free_first, history=history)
     if outcome.status in (Status.CONVERGED, Status.STOPPED):

@@ -179,7 +179,7 @@ class Replanner:
         np.clip(controls, model.lower, model.upper, out=controls)
         batch = {name: np.array(getattr(tails, name)) for name in FIELDS if name not in ("x", "u")}
         batch |= {"x": states, "u": controls}
-        posed = dataclasses.replace(self.posed, model=model)
+        posed = self.posed.of(model)
         usable = np.zeros(P, dtype=bool)
 
         def part(rows: slice) -> None:
