@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.planner.problem.answers import answers
 from slipcar.planner.problem.jacobians import differences, richardson
 from slipcar.planner.problem.model import Model
 
@@ -96,9 +97,12 @@ def check_assumptions(model: Model, x: Array, u: Array) -> str:
         ValueError: naming the function, the entry and what is assumed of it.
     """
     t, y, v = _points(model, x, u)
-    b, A, sigma, d_sigma = _checked_shapes(model, t, y, v)
-    _check_affine(model, t, y, v, b)
-    return _uncertain_diffusion(model, y, A, sigma, d_sigma)
+    given = answers(model.problem, t, y, v)
+    _check_affine(model, t, y, v, given["drift"])
+    A, _ = model.drift_jacobian(t, y, v)
+    return _uncertain_diffusion(
+        model, y, np.asarray(A), given["diffusion"], model.diffusion_jacobian(t, y)
+    )
 
 
 def _points(model: Model, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -111,47 +115,6 @@ def _points(model: Model, x: Array, u: Array) -> tuple[Array, Array, Array]:
     y = np.concatenate([x[k], x[k] + spread_x * rng.normal(size=(half, x.shape[1]))])
     v = np.concatenate([u[k], u[k] + spread_u * rng.normal(size=(half, u.shape[1]))])
     return np.tile(model.times[k], 2), y, model.admissible(v)
-
-
-def _checked_shapes(model: Model, t: Array, x: Array, u: Array) -> tuple[Array, ...]:
-    """b, ∂b/∂x, σ and ∂σ/∂x at the points, after a look at every function's shape.
-
-    A function that ignores its batch, or whose shape depends on the point, is found out.
-    """
-    n, m, P = model.state_dim, model.control_dim, len(t)
-    p, q = len(model.weight), np.shape(model.terminal(x[:1]))[1]
-    b, (A, B) = model.drift(t, x, u), model.drift_jacobian(t, x, u)
-    sigma, d_sigma = model.diffusion(t, x), model.diffusion_jacobian(t, x)
-    d = np.shape(sigma)[-1] if np.ndim(sigma) else 0
-    answers: list[tuple[str, Any, tuple[int, ...]]] = [
-        ("drift(t, x, u)", b, (n,)),
-        ("drift_jacobian(t, x, u)[0]", A, (n, n)),
-        ("drift_jacobian(t, x, u)[1]", B, (n, m)),
-        ("diffusion(t, x)", sigma, (n, d)),
-        ("diffusion_jacobian(t, x)", d_sigma, (n, d, n)),
-        ("penalty(t, x)", model.penalty(t, x), (p,)),
-        ("penalty_jacobian(t, x)", model.penalty_jacobian(t, x), (p, n)),
-        ("terminal(x)", model.terminal(x), (q,)),
-        ("terminal_jacobian(x)", model.terminal_jacobian(x), (q, n)),
-    ]
-    if model.state_cost is not None:
-        gradient, hessian = model.state_cost_derivatives(t, x)
-        answers += [
-            ("state_cost(t, x)", model.state_cost(t, x), ()),
-            ("state_cost_derivatives(t, x)[0]", gradient, (n,)),
-            ("state_cost_derivatives(t, x)[1]", hessian, (n, n)),
-        ]
-    if model.control_cost is not None:
-        answers += [
-            ("control_cost(t, x)", model.control_cost(t, x), (m,)),
-            ("control_cost_jacobian(t, x)", model.control_cost_jacobian(t, x), (m, n)),
-        ]
-    for name, value, shape in answers:
-        if np.shape(value) != (P, *shape):
-            raise ValueError(
-                f"{name} must have shape {(P, *shape)} for {P} points, not {np.shape(value)}"
-            )
-    return np.asarray(b), np.asarray(A), np.asarray(sigma), np.asarray(d_sigma)
 
 
 def _check_affine(model: Model, t: Array, x: Array, u: Array, b: Array) -> None:
@@ -213,34 +176,31 @@ def check_derivatives(model: Model, x: Array, u: Array) -> None:
         ValueError: naming the function, the entry and both values.
     """
     t, y, v = _points(model, x, u)
-    A, B = model.drift_jacobian(t, y, v)
-    _compare(model, "drift_jacobian", "[0]", A, lambda z: model.drift(t, z, v), y)
-    _compare(model, "drift_jacobian", "[1]", B, lambda z: model.drift(t, y, z), v)
-    _compare(
-        model, "diffusion_jacobian", "", model.diffusion_jacobian(t, y),
-        lambda z: model.diffusion(t, z), y,
-    )  # fmt: skip
-    _compare(
-        model, "penalty_jacobian", "", model.penalty_jacobian(t, y),
-        lambda z: model.penalty(t, z), y,
-    )  # fmt: skip
-    _compare(model, "terminal_jacobian", "", model.terminal_jacobian(y), model.terminal, y)
-    H, derivatives = model.state_cost, model.state_cost_derivatives
-    if H is not None:
-        gradient, hessian = derivatives(t, y)
-        name = "state_cost_derivatives"
-        _compare(model, name, "[0]", gradient, lambda z: H(t, z), y)
-        _compare(model, name, "[1]", hessian, lambda z: derivatives(t, z)[0], y)
-    linear, jacobian = model.control_cost, model.control_cost_jacobian
-    if linear is not None:
-        _compare(model, "control_cost_jacobian", "", jacobian(t, y), lambda z: linear(t, z), y)
+    slopes, own = model.jacobians, model.problem
+    A, B = slopes.drift(t, y, v)
+    pairs: list[tuple[str, Any, Callable[[Array], Any], Array]] = [
+        ("drift_jacobian[0]", A, lambda z: own.drift(t, z, v), y),
+        ("drift_jacobian[1]", B, lambda z: own.drift(t, y, z), v),
+    ]
+    for name in ("diffusion", "penalty", "control_cost", "terminal"):
+        if model.has(name):
+            function: Any = getattr(own, name)
+            at = (lambda z, f=function: f(z)) if name == "terminal" else (
+                lambda z, f=function: f(t, z))  # fmt: skip
+            pairs.append((f"{name}_jacobian", slopes.state(name, t, y), at, y))
+    if model.has("state_cost"):
+        gradient, hessian = slopes.state_cost(t, y)
+        label, cost = "state_cost_derivatives", model.state_cost
+        pairs += [
+            (f"{label}[0]", gradient, lambda z: cost(t, z), y),  # type: ignore[misc]
+            (f"{label}[1]", hessian, lambda z: slopes.state_cost(t, z)[0], y),
+        ]
+    for name, given, function, z in pairs:
+        _compare(model, name, np.asarray(given), function, z)
 
 
-def _compare(
-    model: Model, name: str, part: str, given: Any, f: Callable[[Array], Array], x: Array
-) -> None:
+def _compare(model: Model, name: str, given: Array, f: Callable[[Array], Any], x: Array) -> None:
     """Raise where a Jacobian (P, ..., n) is not what differences of f with respect to x are."""
-    given = np.asarray(given)
     best, spread = richardson(lambda step: differences(f, x, step))
     size = np.maximum(np.abs(given), np.abs(best))
     allowed = _JACOBIAN * (size + _largest(size)) + 10.0 * spread
@@ -249,11 +209,11 @@ def _compare(
     if not wrong.any():
         return
     index = tuple(int(i) for i in np.argwhere(wrong)[0])
-    analytic = getattr(model.problem, name, None) is not None
+    analytic = getattr(model.problem, name.split("[")[0], None) is not None
     source = "your function" if analytic else "traced"
     advice = "" if analytic else "; is the function smooth there? otherwise give its derivative"
     raise ValueError(
-        f"{name}{part}{list(index[1:])} ({source}) is {given[index]:.9g} at "
+        f"{name}{list(index[1:])} ({source}) is {given[index]:.9g} at "
         f"{_show(x[index[0]])}, but differences give {best[index]:.9g}{advice}"
     )
 

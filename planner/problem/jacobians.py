@@ -191,7 +191,7 @@ def _compare(
     """Raise where numerical derivatives are not what independent differences give."""
     flat_x = x.reshape(-1, x.shape[-1])
     chosen = np.linspace(0, len(flat_x) - 1, min(_POINTS, len(flat_x))).astype(int)
-    flat_u = u.reshape(-1, u.shape[-1])
+    flat_u = u.reshape(len(flat_x), u.shape[-1])
     at = np.broadcast_to(t, x.shape[:-1]).reshape(-1)[chosen], flat_x[chosen], flat_u[chosen]
     both = functools.partial(slopes, *at)
     for i, part in enumerate(parts[:1] if name == "state_cost" else parts):

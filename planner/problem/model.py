@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.problem import numbers
+from slipcar.planner.problem.answers import answers
 from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
 from slipcar.planner.problem.integrators import change
 from slipcar.planner.problem.jacobians import Jacobians
@@ -202,10 +203,9 @@ class Model:
         Raises:
             ValueError: if they have the wrong shape at the start, or are not finite there.
         """
-        if not self.has("constraint"):
-            return 0
-        at = self.times[:2], np.stack([self.start, self.start])
-        return _answer(self.problem, "constraint", (2, None), *at).shape[1]
+        x2, u2 = np.stack([self.start, self.start]), np.zeros((2, self.control_dim))
+        given = answers(self.problem, self.times[:2], x2, u2, names=("constraint",), at_start=True)
+        return given["constraint"].shape[1] if given else 0
 
     def control_cost_jacobian(self, t: Array, x: Array) -> Array:
         """∂ℓ/∂x, (..., m, n)."""
@@ -301,63 +301,21 @@ def _checked(problem: Any) -> Model:
         radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
         weight=np.zeros(0),
     )
-    model = dataclasses.replace(model, weight=_checked_functions(model))
+    model = dataclasses.replace(model, weight=_checked_penalties(model))
     for name in ("state_dim", "control_dim", "bounded", "R_inverse", "unit", "longest_dt"):
         getattr(model, name)  # once, for all copies of it
     return model
 
 
-def _checked_functions(model: Model) -> Array:
-    """Look at every function at the start; the penalties' weights, (p,)."""
-    problem: Any = model.problem
-    n, m = model.state_dim, model.control_dim
-    t2, x2, u2 = model.times[:2], np.stack([model.start, model.start]), np.zeros((2, m))
-    for argument in (t2, x2, u2):
-        argument.setflags(write=False)
-    at_start = functools.partial(_answer, problem)
-    at_start("drift", (2, n), t2, x2, u2)
-    d = at_start("diffusion", (2, n, None), t2, x2).shape[2]
-    q = at_start("terminal", (2, None), x2).shape[1]
-    weight = np.zeros(0)
-    if model.has("penalty"):
-        p = at_start("penalty", (2, None), t2, x2).shape[1]
-        weight = finite("penalty_weight", problem.penalty_weight, (p,))
-        if (weight < 0).any():
-            raise ValueError(f"penalty_weight must be >= 0, not {weight!r}")
-        if model.has("penalty_jacobian"):
-            at_start("penalty_jacobian", (2, p, n), t2, x2)
-    if model.has("drift_jacobian"):
-        A, B = problem.drift_jacobian(t2, x2, u2)
-        finite("drift_jacobian(t, x, u)[0]", A, (2, n, n))
-        finite("drift_jacobian(t, x, u)[1]", B, (2, n, m))
-    if model.has("diffusion_jacobian"):
-        at_start("diffusion_jacobian", (2, n, d, n), t2, x2)
-    if model.has("terminal_jacobian"):
-        at_start("terminal_jacobian", (2, q, n), x2)
-    if model.has("state_cost"):
-        at_start("state_cost", (2,), t2, x2)
-        if model.has("state_cost_derivatives"):
-            gradient, hessian = problem.state_cost_derivatives(t2, x2)
-            finite("state_cost_derivatives(t, x)[0]", gradient, (2, n))
-            finite("state_cost_derivatives(t, x)[1]", hessian, (2, n, n))
-    if model.has("control_cost"):
-        at_start("control_cost", (2, m), t2, x2)
-        if model.has("control_cost_jacobian"):
-            at_start("control_cost_jacobian", (2, m, n), t2, x2)
+def _checked_penalties(model: Model) -> Array:
+    """The penalties' weights, (p,), after a look at every function at the start."""
+    x2, u2 = np.stack([model.start, model.start]), np.zeros((2, model.control_dim))
+    names = ("drift", "diffusion", "terminal", "penalty", "state_cost", "control_cost")
+    given = answers(model.problem, model.times[:2], x2, u2, names=names, at_start=True)
+    if "penalty" not in given:
+        return np.zeros(0)
+    own: Any = model.problem
+    weight = finite("penalty_weight", own.penalty_weight, (given["penalty"].shape[1],))
+    if (weight < 0).any():
+        raise ValueError(f"penalty_weight must be >= 0, not {weight!r}")
     return weight
-
-
-def _answer(problem: Any, name: str, shape: tuple[int | None, ...], *arguments: Array) -> Array:
-    """A function's answer at two points, checked; its arguments cannot be written to."""
-    signature = {1: "x", 2: "t, x", 3: "t, x, u"}[len(arguments)]
-    label = f"{name}({signature})"
-    try:
-        value = getattr(problem, name)(*arguments)
-    except ValueError as error:
-        if "read-only" in str(error):
-            raise ValueError(
-                f"{label} wrote into its argument ({error}): copy it first, x = x.copy()"
-            ) from error
-        raise
-    label += "" if name.endswith("_jacobian") else " at the start"
-    return finite(label, value, shape)

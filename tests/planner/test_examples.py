@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.stats import rice
 
 from slipcar.planner import Feedback, Problem, Status, plan
-from slipcar.planner.newton.traced import trace
+from slipcar.planner.newton.posing import pose
 from slipcar.planner.problem.model import model_of
 
 FOLDER = Path(__file__).parents[2] / "examples"
@@ -54,18 +54,19 @@ def test_example_is_short(name):
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=lambda s: type(s).__name__)
 def test_systems_are_sound_and_can_be_traced(system):
-    # Tracing refuses whatever branches on a value; what it recorded computes the same.
+    # What the trace recorded computes the same.
     assert isinstance(system, Problem)
     assert plan(system, check_derivatives=True).status is Status.CONVERGED
     model = model_of(system)
-    kernels = trace(model, native=False)
-    rng = np.random.default_rng(0)
-    t, dt = rng.uniform(0.0, 1.0, (2, 7))
-    x, u = rng.normal(size=(7, model.state_dim)), rng.normal(size=(7, model.control_dim))
-    found = kernels.stage(t=t[:, None], dt=dt[:, None], x=x, u=u, parameters=np.zeros((1, 1)))
-    np.testing.assert_allclose(found["next"], x + dt[:, None] * system.drift(t, x, u), rtol=1e-12)
-    sigma = system.diffusion(t, x)
-    np.testing.assert_allclose(found["sigma"].reshape(sigma.shape), sigma, atol=1e-13)
+    posed = pose(model)
+    assert posed.reason == ""
+    rng, n = np.random.default_rng(0), model.state_dim
+    t, dt = rng.uniform(0.0, 1.0, 7), 0.3
+    x, u = rng.normal(size=(7, n)), rng.normal(size=(7, model.control_dim))
+    found = posed.problem.values(t, dt, x, u, posed.numbers)
+    np.testing.assert_allclose(found[:, :n], x + dt * system.drift(t, x, u), rtol=1e-12)
+    sigma = system.diffusion(t, x).reshape(7, -1)
+    np.testing.assert_allclose(found[:, n : n + sigma.shape[1]], sigma, atol=1e-13)
 
 
 # ------------------------------------------------------------------ linear_quadratic.py

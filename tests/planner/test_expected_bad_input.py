@@ -122,16 +122,25 @@ def test_several_starts_and_a_guess_exclude_each_other(paper):
 # ------------------------------------------------------------------------------ constraints
 
 
-def test_a_constraint_of_the_wrong_shape_is_refused():
-    flat = cart(constraint=lambda t, x: x[..., 0] - 2.0)
-    with pytest.raises(ValueError, match=r"constraint|penalty"):
-        plan(flat, risk=0.1)
-
-
-def test_a_constraint_that_is_not_finite_is_refused():
-    broken = cart(constraint=lambda t, x: np.log(x[..., :1] - 5.0))
-    with pytest.raises(ValueError, match=r"constraint|penalty|finite"), np.errstate(all="ignore"):
-        plan(broken, risk=0.1)
+@pytest.mark.parametrize("wanted", WANTED, ids=lambda w: next(iter(w)))
+@pytest.mark.parametrize(
+    ("constraint", "message"),
+    [
+        (lambda t, x: x[..., 0] - 2.0, r"shape \(2, any\), not \(2,\)"),
+        (lambda t, x: np.zeros((3, 1)), r"shape \(2, any\), not \(3, 1\)"),
+        (lambda t, x: np.log(x[..., :1] - 5.0), "must be finite"),
+        (lambda t, x: "far", "must be numbers"),
+        (lambda t, x: None, "shape"),
+    ],
+    ids=["flat", "other points", "infinite", "text", "nothing"],
+)
+def test_what_a_constraint_returns_is_looked_at(constraint, message, wanted):
+    problem = cart(constraint=constraint)
+    with (
+        pytest.raises(ValueError, match=r"constraint\(t, x\).*" + message),
+        np.errstate(all="ignore"),
+    ):
+        plan(problem, **wanted)
 
 
 # ------------------------------------------------------------------------------ typed ends

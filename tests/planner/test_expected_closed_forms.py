@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slipcar.planner.search.field import expected_cost, value
+from slipcar.planner.search.field import charged, expected_cost
 
 
 def additive(mass, *, nodes=16):
@@ -14,15 +14,18 @@ def additive(mass, *, nodes=16):
     return problem
 
 
+@pytest.mark.parametrize("compiled", [None, False])
 @pytest.mark.parametrize("feedback", [True, False])
-def test_additive_noise_leaves_the_regulators_mean(feedback, settle, mass):
+def test_additive_noise_leaves_the_regulators_mean(feedback, compiled, settle, mass):
     """Certainty equivalence, E J = x₀ᵀP₀x₀ + Σ dt tr(Pσσᵀ), and the same by simulation."""
-    ready, stakes, found = settle(additive(mass), soft=True, feedback=feedback, price=0.0)
-    assert found.status.ok
-    model = ready.model
+    posed, stakes, answer = settle(
+        additive(mass), compiled=compiled, soft=True, feedback=feedback, price=0.0
+    )
+    assert answer.status.ok
+    model = posed.model
     dt, t, n = model.dt, model.times, 4
-    A, B = model.drift_jacobian(t[:-1], found.x[:-1], found.u)
-    sigma, shape = model.diffusion(t[:-1], found.x[:-1]), np.diag([0.2, 0.1, 0.4, 0.3]) + 0.05
+    A, B = model.drift_jacobian(t[:-1], answer.x[:-1], answer.u)
+    sigma, shape = model.diffusion(t[:-1], answer.x[:-1]), np.diag([0.2, 0.1, 0.4, 0.3]) + 0.05
     # Riccati's recursion written out, H charged at nodes 1..K with the dt that ends there.
     V = dt[-1] * shape + np.diag(stakes.terminal)
     W = V.copy()  # of deviations
@@ -37,18 +40,20 @@ def test_additive_noise_leaves_the_regulators_mean(feedback, settle, mass):
         W = V if feedback else F.T @ W @ F + here
     x = model.start
     for k, law in enumerate(laws):
-        np.testing.assert_allclose(found.u[k], law @ x, atol=1e-7)
-        np.testing.assert_allclose(found.gains[k], law if feedback else 0.0, atol=1e-9)
-        x = x + dt[k] * model.drift(t[k], x, found.u[k])
+        np.testing.assert_allclose(answer.u[k], law @ x, atol=1e-7)
+        np.testing.assert_allclose(answer.gains[k], law if feedback else 0.0, atol=1e-9)
+        x = x + dt[k] * model.drift(t[k], x, answer.u[k])
     expected = model.start @ V @ model.start + noise
-    assert value(model, stakes, found) == pytest.approx(expected, rel=1e-9)
-    total = expected_cost(model, stakes, found).total
+    assert charged(model, stakes, answer) == pytest.approx(expected, rel=1e-9)
+    total = expected_cost(model, stakes, answer).total
     assert total == pytest.approx(expected, rel=1e-9)
+    # What the iteration itself charges, P and gains held, is the same.
+    assert answer.objective == pytest.approx(expected, rel=1e-9)
     # By simulation.
     rng, paths = np.random.default_rng(1), 100_000
     x, costs = np.tile(model.start, (paths, 1)), np.zeros(paths)
     for k in range(len(dt)):
-        u = found.u[k] + (x - found.x[k]) @ found.gains[k].T
+        u = answer.u[k] + (x - answer.x[k]) @ answer.gains[k].T
         costs += dt[k] * np.einsum("ei,ij,ej->e", u, model.R, u)
         x = x + dt[k] * model.drift(t[k], x, u)
         x += np.sqrt(dt[k]) * rng.standard_normal((paths, 2)) @ sigma[k].T
@@ -59,10 +64,10 @@ def test_additive_noise_leaves_the_regulators_mean(feedback, settle, mass):
 
 def test_least_effort_to_an_exact_end_is_the_least_norm_solution(settle, mass):
     problem = mass(walls=False, slip=0.0, curved=False)
-    ready, _, found = settle(problem, soft=False, feedback=False, price=0.0)
-    model = ready.model
+    posed, _, answer = settle(problem, soft=False, feedback=False, price=0.0)
+    model = posed.model
     K, m, n = len(model.dt), 2, 4
-    A, B = model.drift_jacobian(model.times[:-1], found.x[:-1], found.u)
+    A, B = model.drift_jacobian(model.times[:-1], answer.x[:-1], answer.u)
     reach, free = np.zeros((n, K * m)), model.start
     for k in range(K):
         F = np.eye(n) + model.dt[k] * A[k]
@@ -71,7 +76,7 @@ def test_least_effort_to_an_exact_end_is_the_least_norm_solution(settle, mass):
     weight = np.linalg.inv(np.kron(np.diag(model.dt), model.R))
     goal = -model.terminal(np.zeros(n))
     u = weight @ reach.T @ np.linalg.solve(reach @ weight @ reach.T, goal - free)
-    np.testing.assert_allclose(found.u, u.reshape(K, m), atol=1e-8)
+    np.testing.assert_allclose(answer.u, u.reshape(K, m), atol=1e-8)
 
 
 def test_multipliers_at_a_solution_are_the_marginal_cost_of_the_end(settle, mass, nominal):
@@ -80,14 +85,14 @@ def test_multipliers_at_a_solution_are_the_marginal_cost_of_the_end(settle, mass
     goal = np.array([1.0, 0.7, 0.0, 0.0])
     start = nominal(problem)
     asked = {"soft": False, "feedback": False, "price": 2.0, "tolerance": 1e-18, "start": start}
-    _, _, found = settle(problem, **asked)
+    _, _, answer = settle(problem, **asked)
     for i in range(4):
         costs = []
         for sign in (1.0, -1.0):
             moved = mass()
             to = goal + sign * h * np.eye(4)[i]
             moved.terminal = lambda x, to=to: x - to
-            ready, stakes, there = settle(moved, **asked)
-            costs.append(value(ready.model, stakes, there))
+            posed, stakes, there = settle(moved, **asked)
+            costs.append(charged(posed.model, stakes, there))
         # L = J + νᵀg with g = x − goal: dJ/dgoal = −ν.
-        assert (costs[0] - costs[1]) / (2 * h) == pytest.approx(-found.terminal[i], rel=1e-3)
+        assert (costs[0] - costs[1]) / (2 * h) == pytest.approx(-answer.terminal[i], rel=1e-3)

@@ -5,6 +5,7 @@ the non-linear problem, as a function of controls and gains alone.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -188,9 +189,9 @@ def test_a_dearer_risk_is_a_smaller_one_and_costs_more(settle, mass):
         risks.append(norm.cdf(c[:, 1:] / s[:, 1:]).sum())  # after the one penalty
         costs.append(expected_cost(posed.model, stakes, answer).total)
     # Optimality at two prices implies both, for global optima of the same objective.
-    for before, after in zip(risks, risks[1:], strict=False):
+    for before, after in itertools.pairwise(risks):
         assert after <= before * (1.0 + 1e-3)
-    for before, after in zip(costs, costs[1:], strict=False):
+    for before, after in itertools.pairwise(costs):
         assert after >= before * (1.0 - 1e-6)
     assert risks[-1] < 0.1 * risks[0]
 

@@ -131,7 +131,58 @@ def test_compiled_and_numpy_agree_on_a_puck(feedback):
         plan(TunedPuck(), risk_price=3.0, feedback=feedback, compiled=c) for c in (None, False)
     )
     assert slow.status.ok
-    np.testing.assert_allclose(fast.controls, slow.controls, atol=1e-6)
+    np.testing.assert_allclose(fast.controls, slow.controls, atol=1e-10)
+
+
+def pendulum(**members):
+    """A pendulum pushed from rest, with little noise on its angle and rate."""
+    known = {
+        "start": np.array([0.0, 0.3]),
+        "times": np.linspace(0.0, 1.0, 9),
+        "control_weight": np.eye(1),
+        "drift": lambda t, x, u: np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1),
+        "diffusion": lambda t, x: np.broadcast_to(np.array([[0.1], [0.05]]), (*x.shape, 1)),
+        "terminal": lambda x: x - np.array([1.0, 0.0]),
+        "constraint": lambda t, x: np.stack([x[..., 0] - 1.3, x[..., 1] ** 2 - 4.0], axis=-1),
+    }
+    return types.SimpleNamespace(**known | members)
+
+
+ODD = {
+    "no end": {"terminal": lambda x: x[..., :0], "state_cost": lambda t, x: (x[..., 0] - 1.0) ** 2},
+    "no noise": {"diffusion": lambda t, x: np.zeros((*x.shape, 0))},
+    "noise of zero": {"diffusion": lambda t, x: np.zeros((*x.shape, 1))},
+    "no penalties": {"penalty": lambda t, x: x[..., :0], "penalty_weight": np.zeros(0)},
+    "free penalties": {"penalty": lambda t, x: x[..., :1], "penalty_weight": np.zeros(1)},
+    "one bound": {"control_bounds": np.array([[-np.inf], [2.5]])},
+    "cost with saddles": {"state_cost": lambda t, x: np.cos(3.0 * x[..., 0]) + x[..., 1] ** 2},
+    "cost of controls": {"control_cost": lambda t, x: 0.3 * x[..., :1]},
+    "an end of no weight": {"terminal_weight": np.zeros(2)},
+}
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.parametrize("odd", ODD)
+def test_what_is_empty_zero_or_not_convex_is_planned_alike_by_both_engines(odd, feedback):
+    problem = pendulum(**ODD[odd])
+    fast, slow = (
+        plan(problem, risk_price=2.0, feedback=feedback, compiled=c) for c in (None, False)
+    )
+    assert fast.status is slow.status is Status.CONVERGED
+    np.testing.assert_allclose(fast.controls, slow.controls, atol=1e-9)
+    np.testing.assert_allclose(fast.covariance, slow.covariance, atol=1e-12)
+    if feedback:
+        np.testing.assert_allclose(fast.gains, slow.gains, atol=1e-9)
+    # The mean is where the controls lead, and noise spreads by the closed loop.
+    x, S, sigma = problem.start, np.zeros((2, 2)), problem.diffusion(0.0, problem.start)
+    for k, dt in enumerate(np.diff(problem.times)):
+        np.testing.assert_allclose(fast.mean[k], x, atol=1e-4)
+        np.testing.assert_allclose(fast.covariance[k], S, atol=1e-6)
+        A = np.eye(2) + dt * np.array([[0.0, 1.0], [-np.cos(x[0]), 0.0]])
+        if feedback:
+            A = A + dt * np.array([[0.0], [1.0]]) @ fast.gains[k]
+        x = x + dt * problem.drift(0.0, x, fast.controls[k])
+        S = A @ S @ A.T + dt * sigma @ sigma.T
 
 
 def test_feedback_is_safer_and_cheaper_than_none():

@@ -1,34 +1,19 @@
-"""The iteration on expected costs is one on every path: compiled or not, warm or cold."""
+"""The iteration on expected costs is one on every path: machine code or NumPy, traced or called."""
 
-import importlib.util
+import types
 
 import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status
-from slipcar.planner.expected import loop
-from slipcar.planner.expected.guarded import posed
-from slipcar.planner.problem.derivatives import complex_step_jacobian
+from slipcar.planner.newton.posing import pose
+from slipcar.planner.newton.quantities import Traced
+from slipcar.planner.newton.running import advance, solve_noise
+from slipcar.planner.problem.model import model_of
+from slipcar.planner.trace import machine_code
 
-NUMBA = importlib.util.find_spec("numba") is not None
-needs_numba = pytest.mark.skipif(not NUMBA, reason="needs numba")
-
-
-def _same(a, b, atol=1e-8):
-    assert a.status is b.status
-    assert a.iterations == b.iterations
-    for name in ("u", "x", "gains", "covariance", "c", "s", "A", "B", "held"):
-        one, two = getattr(a, name), getattr(b, name)
-        scale = 1.0 + np.abs(two).max(initial=0.0)
-        np.testing.assert_allclose(one, two, atol=atol * scale, rtol=0.0, err_msg=name)
-    for name in ("adjoint", "terminal"):
-        one, two = getattr(a, name), getattr(b, name)
-        scale = 1.0 + np.abs(two).max(initial=0.0)
-        np.testing.assert_allclose(one, two, atol=10 * atol * scale, rtol=0.0, err_msg=name)
-    for name in ("effort", "running", "objective"):
-        assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-7)
-
+needs_llvm = pytest.mark.skipif(not machine_code.available(), reason="needs llvmlite")
 
 MASSES = {
     "open": {"soft": False, "feedback": False, "price": 0.0},
@@ -49,117 +34,187 @@ CARS = {
     "feedback exact": {"soft": False, "feedback": True, "price": 30.0},
 }
 
+ARRAYS = ("u", "x", "gains", "covariance", "c", "s", "eta", "A", "B", "g", "G")
 
-@needs_numba
+
+def _same(a, b, atol=1e-11):
+    assert a.status is b.status
+    assert a.iterations == b.iterations
+    for name in (*ARRAYS, "adjoint", "terminal"):
+        one, two = getattr(a, name), getattr(b, name)
+        scale = 1.0 + np.abs(two).max(initial=0.0)
+        np.testing.assert_allclose(one, two, atol=atol * scale, rtol=0.0, err_msg=name)
+    for name in ("effort", "running", "objective"):
+        assert getattr(a, name) == pytest.approx(getattr(b, name), rel=10.0 * atol)
+
+
+def _identical(a, b):
+    for name in (*ARRAYS, "adjoint", "terminal"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+# ------------------------------------------------------------------------- machine code or NumPy
+
+
+@needs_llvm
 @pytest.mark.parametrize("kind", CARS)
-def test_compiled_steps_are_those_of_numpy_on_the_paper_case(paper, kind, settle, nominal):
-    start = nominal(paper)
-    asked = {"start": start, "tolerance": 1e-6, **CARS[kind]}
-    _, _, slow = settle(paper, **asked)
-    _, _, fast = settle(paper, native=True, **asked)
+def test_machine_code_steps_as_numpy_does_on_the_paper_case(paper, kind, settle, nominal):
+    asked = {"start": nominal(paper), "tolerance": 1e-6, **CARS[kind]}
+    _, _, slow = settle(paper, compiled=False, **asked)
+    _, _, fast = settle(paper, compiled=True, **asked)
     assert slow.status is Status.CONVERGED
     _same(fast, slow)
     # And when each goes on from the other's answer at another price.
-    again = {**asked, "price": 3.0 * asked["price"] + 1.0}
-    a = settle(paper, **{**again, "start": (fast.x, fast.u)}, warm=fast)[2]
-    b = settle(paper, native=True, **{**again, "start": (slow.x, slow.u)}, warm=slow)[2]
-    _same(b, a, atol=1e-7)
+    again = {**asked, "start": (fast.x, fast.u), "warm": fast}
+    if asked["price"]:
+        again["price"] = 3.0 * asked["price"]
+    else:
+        again["terminal"] = 50.0
+    a = settle(paper, compiled=False, **again)[2]
+    b = settle(paper, compiled=True, **again)[2]
+    _same(b, a)
 
 
-@needs_numba
+@needs_llvm
 @pytest.mark.parametrize("seed", range(6))
-def test_compiled_steps_are_those_of_numpy_in_random_worlds(seed, settle, nominal):
+def test_machine_code_steps_as_numpy_does_in_random_worlds(seed, settle, nominal):
     world = Scenario.random(seed, turned=seed % 2 == 1)
     kind = list(CARS)[seed]
     start = nominal(world)
     # Few steps: far from a solution chaos takes over, not rounding.
     for limit in (3, 100):
         asked = {"start": start, "tolerance": 1e-4, "limit": limit, **CARS[kind]}
-        slow, fast = (settle(world, native=native, **asked)[2] for native in (False, True))
+        slow, fast = (settle(world, compiled=compiled, **asked)[2] for compiled in (False, True))
         if limit == 3 or (slow.status.ok and fast.status.ok):
-            _same(fast, slow, atol=1e-8 if limit == 3 else 1e-6)
+            _same(fast, slow, atol=1e-10 if limit == 3 else 1e-7)
         else:
             assert slow.status is fast.status
 
 
-@needs_numba
+@needs_llvm
 @pytest.mark.parametrize("kind", MASSES)
-def test_compiled_steps_are_those_of_numpy_for_a_traced_problem(kind, settle, mass, nominal):
+def test_machine_code_steps_as_numpy_does_for_a_point_mass(kind, settle, mass, nominal):
     problem = mass()
-    start = nominal(problem)
-    asked = {"start": start, "tolerance": 1e-8, **MASSES[kind]}
-    _, _, slow = settle(problem, **asked)
-    _, _, fast = settle(problem, native=True, **asked)
-    _same(fast, slow, atol=1e-7)
+    asked = {"start": nominal(problem), "tolerance": 1e-8, **MASSES[kind]}
+    _, _, slow = settle(problem, compiled=False, **asked)
+    _, _, fast = settle(problem, compiled=True, **asked)
+    _same(fast, slow)
 
 
-@needs_numba
+@needs_llvm
 @pytest.mark.parametrize("feedback", [False, True])
-def test_compiled_steps_are_those_of_numpy_at_bounds(feedback, settle, mass, nominal):
+def test_machine_code_steps_as_numpy_does_at_bounds(feedback, settle, mass, nominal):
     asked = {"soft": True, "feedback": feedback, "price": 1.0, "terminal": 30.0, "tolerance": 1e-8}
     _, _, free = settle(mass(), **asked)
     problem = mass(bounds=0.9 * np.abs(free.u).max(axis=0))
     asked["start"] = nominal(problem)
-    _, _, slow = settle(problem, **asked)
-    _, _, fast = settle(problem, native=True, **asked)
-    _same(fast, slow, atol=1e-7)
+    _, _, slow = settle(problem, compiled=False, **asked)
+    _, _, fast = settle(problem, compiled=True, **asked)
+    _same(fast, slow)
 
 
-def test_a_warm_start_at_a_solution_stays_there(paper, settle):
-    asked = {"soft": True, "feedback": True, "price": 10.0}
-    _, _, found = settle(paper, tolerance=1e-14, **asked)
-    _, _, again = settle(paper, tolerance=1e-8, start=(found.x, found.u), warm=found, **asked)
-    assert again.status.ok
-    assert again.iterations <= 3
-    np.testing.assert_allclose(again.u, found.u, atol=1e-4)
+# ------------------------------------------------------------------------- traced or called
 
 
-def test_a_solution_does_not_depend_on_damping_or_on_where_it_came_from(settle, mass):
-    answers = []
-    for damping, price in ((0.3, None), (0.7, None), (0.5, 30.0)):
-        warm, start = None, None
-        if price is not None:  # by way of another price
-            _, _, warm = settle(mass(), soft=True, feedback=True, price=price)
-            start = (warm.x, warm.u)
-        _, _, found = settle(
-            mass(), soft=True, feedback=True, price=3.0, damping=damping, start=start, warm=warm
-        )
-        assert found.status.ok
-        answers.append(found)
-    for other in answers[1:]:
-        np.testing.assert_allclose(other.u, answers[0].u, atol=1e-5)
-        np.testing.assert_allclose(other.gains, answers[0].gains, atol=1e-4)
+def _opaque(function):
+    """The same function by way of Python's numbers: it cannot be traced."""
+
+    def numbers(a):
+        return np.array([float(entry) for entry in np.ravel(a)]).reshape(np.shape(a))
+
+    return lambda *arguments: function(*map(numbers, arguments))
 
 
-def test_a_guess_where_the_model_is_not_finite_is_refused(mass, expected_stakes):
-    problem = mass()
-    ready = posed(problem)
-    x, u = ready.model.guess()
-    functions = ready.functions(x, u, native=False)
-    x = x.copy()
-    x[3] = np.nan
-    stakes = expected_stakes(ready, soft=True, feedback=True, price=1.0)
+def _called(problem):
+    """The same problem, of functions that can only be called, without any derivatives."""
+    functions = ("drift", "diffusion", "terminal", "penalty", "constraint", "state_cost")
+    numbers = ("start", "times", "control_weight", "control_bounds", "penalty_weight")
+    members = {name: getattr(problem, name) for name in numbers if hasattr(problem, name)}
+    known = [name for name in functions if getattr(problem, name, None) is not None]
+    members |= {name: _opaque(getattr(problem, name)) for name in known}
+    return types.SimpleNamespace(**members)
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+@pytest.mark.parametrize("kind", ["open priced", "feedback priced"])
+@pytest.mark.parametrize("which", ["mass", "paper"])
+def test_functions_that_cannot_be_traced_give_the_same_plan(
+    which, kind, compiled, settle, mass, paper, nominal
+):
+    """By differences: as near as those come, step by step."""
+    problem = mass() if which == "mass" else paper
+    asked = {"start": nominal(problem), "tolerance": 1e-8, **MASSES[kind]}
+    traced, _, known = settle(problem, **asked)
+    called, _, answer = settle(_called(problem), compiled=compiled, **asked)
+    assert isinstance(traced.problem, Traced)
+    assert not isinstance(called.problem, Traced)
+    assert known.status is Status.CONVERGED
+    _same(answer, known, atol=1e-6)
+
+
+# ------------------------------------------------------------------------- one after another
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+def test_what_was_planned_before_leaves_no_trace(compiled, paper, settle, nominal):
+    """Arrays are used again: the same question has the same answer, to the last bit."""
+    asked = {"soft": True, "feedback": True, "price": 10.0, "limit": 3, "compiled": compiled}
+    other = paper.replace(obstacles=paper.obstacles + 0.05)
+    start = nominal(paper)
+    _, _, first = settle(paper, start=start, **asked)
+    settle(other, start=nominal(other), **asked)
     with pytest.raises(ValueError, match="finite"):
-        loop.iterate(
-            ready.model, functions, stakes, x, u, tolerance=1e-6, max_iterations=5, warm=None
+        settle(other, start=(np.full_like(start[0], np.nan), start[1]), **asked)
+    _, _, again = settle(paper, start=start, **asked)
+    _identical(again, first)
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+@pytest.mark.parametrize("kind", ["feedback priced", "feedback exact"])
+def test_a_batch_steps_as_each_of_its_problems_does_alone(kind, compiled, settle, mass):
+    """From other starts, two steps; one whose guess is not finite is said so, and no other's."""
+    bounds = np.array([3.0, 3.0])
+    posed, stakes, plan = settle(mass(bounds=bounds), compiled=compiled, **MASSES[kind])
+    rng, count = np.random.default_rng(0), 4
+    warm = ("gains", "eta", "adjoint", "terminal", "A", "B")
+    batch = {name: np.stack([getattr(plan, name)] * count) for name in ("x", "u", *warm)}
+    batch["x"][:, 0] += 0.05 * rng.normal(size=(count, 4))
+    batch["x"][1, 3] = np.nan
+    guesses = batch["x"].copy()
+    endings = advance(posed, stakes, batch, tolerance=1e-8, max_iterations=2)
+    assert endings[1] is None
+    assert endings[0] is endings[2] is endings[3] is Status.MAX_ITERATIONS
+    for i in (0, 2, 3):
+        alone = solve_noise(
+            posed, stakes, guesses[i], plan.u, tolerance=1e-8, max_iterations=2, warm=plan
         )
+        assert np.abs(alone.u - plan.u).max() > 1e-3
+        np.testing.assert_array_equal(batch["x"][i, 0], guesses[i, 0])
+        for name in ("x", "u", *warm):
+            np.testing.assert_array_equal(batch[name][i], getattr(alone, name), err_msg=name)
 
 
-def test_rows_of_both_kinds_are_kept_apart(paper, nominal):
-    """Penalties first, then constraints, with the Jacobians of both."""
-    ready = posed(paper)
-    model, guarded = ready.model, ready.guarded
-    o = len(paper.obstacles)
-    np.testing.assert_array_equal(guarded.is_constraint, [False] * o + [True] * o)
-    np.testing.assert_array_equal(guarded.penalty_weight[o:], 0.0)
-    x, u = nominal(paper)
-    t = model.times
-    rows = model.penalty(t, x)
-    np.testing.assert_array_equal(rows[:, :o], paper.penalty(t, x))
-    np.testing.assert_array_equal(rows[:, o:], paper.constraint(t, x))
-    known = complex_step_jacobian(lambda y: model.penalty(t, y), x)
-    np.testing.assert_allclose(model.penalty_jacobian(t, x), known, atol=1e-12)
-    functions = ready.functions(x, u, native=False)
-    node = functions.node(t=t[1:], x=x[1:])
-    np.testing.assert_allclose(node["c"], rows[1:], atol=1e-12)
-    np.testing.assert_allclose(node["C"].reshape(known[1:].shape), known[1:], atol=1e-12)
+# ------------------------------------------------------------------------- rows
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+def test_rows_are_the_penalties_then_the_constraints(compiled, paper, nominal):
+    """With a certain state their values; along one direction their slopes."""
+    problems = (paper, _called(paper)) if compiled is None else (paper,)
+    x, _ = nominal(paper)
+    t, v, h = paper.times[1:], np.array([0.3, -0.2, 0.1, 0.05, 0.4]), 1e-6
+    for problem in problems:
+        for constraints in (False, True):
+            posed = pose(model_of(problem), constraints=constraints, compiled=compiled)
+
+            def rows(y, constraints=constraints):
+                both = (paper.penalty(t, y[1:]), paper.constraint(t, y[1:]))
+                return np.concatenate(both[: 1 + constraints], axis=1)
+
+            assert posed.tails == (len(paper.obstacles) if constraints else 0)
+            c, _ = posed.row_moments(x, np.zeros((len(x), 5, 5)))
+            np.testing.assert_allclose(c, rows(x), atol=1e-12)
+            _, s = posed.row_moments(x, np.broadcast_to(np.outer(v, v), (len(x), 5, 5)))
+            slope = np.abs(rows(x + h * v) - rows(x - h * v)) / (2 * h)
+            known = np.maximum(slope, 0.02 * slope.max(axis=0) + 1e-9)
+            np.testing.assert_allclose(s, known, rtol=1e-6, atol=1e-8)

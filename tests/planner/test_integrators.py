@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
-from slipcar.planner.problem.checks import _differences
 from slipcar.planner.problem.integrators import INTEGRATORS, change, jacobian
+from slipcar.planner.problem.jacobians import differences
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import model_of
 
@@ -64,8 +64,8 @@ def test_jacobians_are_those_of_the_step(name):
     x, u = rng.normal(size=(7, 3)), rng.normal(size=(7, 2))
     t, dt = rng.uniform(0.0, 1.0, 7), rng.uniform(0.05, 0.4, 7)
     A, B = jacobian(name, model.drift, model.drift_jacobian, t, dt, x, u)
-    by_x = _differences(lambda y: y + change(name, model.drift, t, dt, y, u), x, 1e-5 + 0.0 * x)
-    by_u = _differences(lambda v: x + change(name, model.drift, t, dt, x, v), u, 1e-5 + 0.0 * u)
+    by_x = differences(lambda y: y + change(name, model.drift, t, dt, y, u), x, 1e-5)
+    by_u = differences(lambda v: x + change(name, model.drift, t, dt, x, v), u, 1e-5)
     np.testing.assert_allclose(A, by_x, atol=1e-9)
     np.testing.assert_allclose(B, by_u, atol=1e-9)
 

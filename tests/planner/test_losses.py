@@ -1,4 +1,4 @@
-"""Losses of rows, Gaussian or certain: against integrals, differences and what convexity promises."""
+"""Losses of Gaussian and certain rows: against integrals, differences and what convexity says."""
 
 import numpy as np
 import pytest

@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import minimize
 
 from slipcar.planner import Plan, Status, plan
-from slipcar.planner.problem.derivatives import gradient_and_hessian
 from slipcar.planner.problem.linearization import linearize, nearest_semidefinite
 from slipcar.planner.problem.model import model_of
 
@@ -116,14 +115,17 @@ def both_ways(f, g):
     return [{"state_cost": f}, {"state_cost": f, "state_cost_derivatives": g}]
 
 
-def test_analytic_derivatives_and_complex_steps_lead_to_the_same_plan():
+@pytest.mark.parametrize("method", ["newton", "convex"])
+def test_given_derivatives_and_traced_ones_lead_to_the_same_plan(method):
     def derivatives(t, x):
         scale = (1.0 + 0.2 * t)[..., None]
         return 2.0 * scale * (x @ Q), 2.0 * scale[..., None] * np.broadcast_to(
             Q, (*x.shape[:-1], 2, 2)
         )
 
-    a, b = (plan(Cart(**m), tolerance=1e-10) for m in both_ways(quadratic, derivatives))
+    a, b = (
+        plan(Cart(**m), tolerance=1e-10, method=method) for m in both_ways(quadratic, derivatives)
+    )
     np.testing.assert_allclose(a.controls, b.controls, atol=1e-9)
 
     def jacobian(t, x):
@@ -133,26 +135,10 @@ def test_analytic_derivatives_and_complex_steps_lead_to_the_same_plan():
 
     linear = {"state_cost": quadratic, "control_cost": lambda t, x: np.sin(x[..., :1])}
     a, b = (
-        plan(Cart(**linear, **m), tolerance=1e-10)
+        plan(Cart(**linear, **m), tolerance=1e-10, method=method)
         for m in ({}, {"control_cost_jacobian": jacobian})
     )
     np.testing.assert_allclose(a.controls, b.controls, atol=1e-9)
-
-
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_gradient_and_hessian_of_a_known_function(batch):
-    x = np.random.default_rng(2).normal(size=(*batch, 3))
-    a = np.array([0.3, -0.7, 1.1])
-    gradient, hessian = gradient_and_hessian(lambda y: np.exp(y @ a) + y[..., 0] * y[..., 2], x)
-    e = np.exp(x @ a)
-    expected = e[..., None] * a
-    expected[..., 0] += x[..., 2]
-    expected[..., 2] += x[..., 0]
-    np.testing.assert_allclose(gradient, expected, rtol=1e-14)
-    exact = e[..., None, None] * np.outer(a, a)
-    exact[..., 0, 2] += 1.0
-    exact[..., 2, 0] += 1.0
-    np.testing.assert_allclose(hessian, exact, atol=1e-8 * np.max(np.abs(exact)))
 
 
 def test_the_nearest_semidefinite_matrix():
