@@ -374,6 +374,10 @@ class Scenario:
 
         A guess with θ = v = 0 along the line leaves r_y uncontrollable (SPEC §2, "start").
         """
+        return self._straight_line.copy(), np.zeros((self.nodes - 1, car.CONTROL_DIM))
+
+    @functools.cached_property
+    def _straight_line(self) -> np.ndarray:
         fraction = (self.times / self.horizon)[:, None]
         x = self.start + fraction * (self.goal - self.start)
         offset = self.goal[:2] - self.start[:2]
@@ -384,7 +388,7 @@ class Scenario:
         x[:, 3] = np.hypot(*offset) / self.horizon
         x[:, 4] = 0.0
         x[0] = self.start
-        return x, np.zeros((self.nodes - 1, car.CONTROL_DIM))
+        return x
 
     def guesses(self, count: int) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """Up to `count` routes past the obstacles: label, states (N, 5), controls (N−1, 2).

@@ -336,8 +336,8 @@ def _probe_points(model: Model) -> tuple[Array, Array, Array]:
 def _called(model: Model, constraints: bool, t: Array, x: Array, u: Array) -> Array:
     """The problem's functions at some points, in the order of `Traced.values`."""
     problem: Any = model.problem
-    dt = np.full(len(t), model.dt[0])
-    values = [x + change(model.integrator, problem.drift, t, dt, x, u), problem.diffusion(t, x)]
+    moved = change(model.integrator, problem.drift, t, model.dt[0], x, u)
+    values = [x + moved, problem.diffusion(t, x)]
     if model.has("control_cost"):
         values.append(problem.control_cost(t, x))
     for name in ("penalty", "constraint"):

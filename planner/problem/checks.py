@@ -15,6 +15,7 @@ are passed over here (along the guess itself they are an error later on).
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -51,6 +52,14 @@ class Facts:
 
     def settle(self, start_covariance: Array) -> bool:
         """Whether nothing is left to be looked at: affine, and no noise in what σ depends on."""
+        return self._calm if not start_covariance.any() else self._settled(start_covariance)
+
+    @functools.cached_property
+    def _calm(self) -> bool:
+        """The same from a known start."""
+        return self._settled(np.zeros((len(self.noisy), len(self.noisy))))
+
+    def _settled(self, start_covariance: Array) -> bool:
         uncertain = self.noisy | (np.diag(start_covariance) > 0.0)
         for _ in range(len(uncertain)):
             grown = uncertain | (self.depends & uncertain).any(axis=1)
