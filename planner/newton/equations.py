@@ -12,8 +12,8 @@ A *point* is a trajectory x, u with its multipliers λ, ν and what follows from
     weights    P, what noise is charged, and the gains K
 
 The mean is the special case of the belief in which rows are certain (s = 0) and only w tr Σ is
-charged for noise. Rows are the problem's penalties, then its constraints where they are priced; what
-a row costs is :mod:`slipcar.planner.moments.losses`' business.
+charged for noise. Rows are the problem's penalties, then its constraints where they are priced;
+what a row costs is said in :mod:`slipcar.planner.moments.losses`.
 """
 
 from __future__ import annotations

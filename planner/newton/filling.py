@@ -160,7 +160,7 @@ class ModelFiller:
             y, v = z[..., :n], z[..., n:]
             tt = np.broadcast_to(t[:K], y.shape[:-1])
             by_x = np.einsum("ckmn,ckm->ckn", np.asarray(model.control_cost_jacobian(tt, y)), v)
-            by_u = np.asarray(model.control_cost(tt, y))
+            by_u = np.asarray(model.control_cost(tt, y))  # type: ignore[misc]
             return dt[:, None] * np.concatenate([by_x, by_u], axis=-1)
 
         z = np.concatenate([x[:K], u], axis=1)

@@ -39,8 +39,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from slipcar.planner.newton.equations import KNOBS, Evaluation, Model, Promise
 from slipcar.planner.lq.riccati import SOFTNESS
+from slipcar.planner.newton.equations import KNOBS, Evaluation, Model, Promise
 from slipcar.planner.newton.program import Workspace
 from slipcar.planner.newton.tuning import Tuning
 from slipcar.planner.problem.linearization import nearest_semidefinite
@@ -441,7 +441,7 @@ class Iteration:
         return shift
 
     def _consistent(self) -> bool:
-        """Whether the end is where it must be and the mean is, to first order, the controls' path."""
+        """Whether the end is where it must be and the mean the controls' path, to first order."""
         at, tuning = self.at, self.tuning
         size = 1.0 + at.size
         feasible = at.residual <= tuning.feasibility * size

@@ -213,14 +213,13 @@ def _traced(model: Model, constraints: bool, named: dict[str, Array]) -> Posed:
         graph=graph, x=x[0], u=u[0], dt=dt[0], next=(x + with_step)[0], sigma=state("diffusion"),
         c=np.concatenate(rows) if rows else np.empty(0, dtype=object),
         g=np.asarray(trace_call("terminal", problem.terminal, x))[0],
-        H=graph.constant(0.0) if H is None else H[()], ell=ell, state_cost=H is not None,
+        H=graph.constant(0.0) if H is None else H.item(), ell=ell, state_cost=H is not None,
         numbers=np.array(graph.numbers or [0.0]),
     )  # fmt: skip
-    structure = graph.structure(*(a.ravel() for a in (
-        traced.next, traced.sigma, traced.c, traced.g, traced.ell, np.array([traced.H]), b[0])))  # fmt: skip
+    outputs = (traced.next, traced.sigma, traced.c, traced.g, ell, np.array([traced.H]), b[0])
+    structure = graph.structure(*(array.ravel() for array in outputs))
     known = _structures.get(structure)
     if known is None:
-        _check_shapes(model, traced)
         known = _structures[structure] = (traced, _facts(traced, b[0]))
         while len(_structures) > 256:
             _structures.pop(next(iter(_structures)))
@@ -242,24 +241,13 @@ def _symbols(graph: Graph, named: dict[str, Array]) -> dict[str, Array]:
         graph.numbers.append(value)
         return graph.make("input", (), ("number", len(graph.numbers) - 1))
 
-    symbols = {}
+    symbols: dict[str, Array] = {}
     for name, value in named.items():
         flat = np.empty(value.size, dtype=object)
         flat[:] = [symbol(float(v)) for v in value.ravel()]
         symbols[name] = flat.reshape(value.shape).view(TracedArray)
         symbols[name].setflags(write=False)
     return symbols
-
-
-def _check_shapes(model: Model, traced: Traced) -> None:
-    n, m = model.state_dim, model.control_dim
-    answers = (
-        ("drift(t, x, u)", traced.next, (n,)), ("diffusion(t, x)", traced.sigma, (n, None)),
-        ("control_cost(t, x)", traced.ell, (m,)),
-    )  # fmt: skip
-    for name, value, shape in answers:
-        if value.ndim != len(shape) or any(w not in (None, s) for s, w in zip(value.shape, shape)):
-            raise ValueError(f"{name} must have shape {shape} at one point, not {value.shape}")
 
 
 def check_assumptions(posed: Posed, x: Array, u: Array, *, charged: bool) -> None:

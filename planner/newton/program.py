@@ -1,8 +1,9 @@
 """Programs and workspaces: the equations of one kind of problem, ready to run on arrays.
 
-A program is machine code (or, without LLVM, the recursions themselves, run by NumPy); a workspace is
-the arrays it runs on, for one number of intervals. Points of a workspace come in pairs, the iterate
-and the candidate: kernels run on either side, and what is `x` to one is `x_new` to the other.
+A program is machine code (or, without LLVM, the recursions themselves, run by NumPy); a workspace
+is the arrays it runs on, for one number of intervals. Points of a workspace come in pairs, the
+iterate and the candidate: kernels run on either side, and what is `x` to one is `x_new` to the
+other.
 """
 
 from __future__ import annotations
@@ -199,7 +200,7 @@ class Workspace:
         self._tables = [
             np.array([a.ctypes.data for a in side.values()], dtype=np.int64) for side in swapped
         ]
-        self.knobs = memoryview(self.arrays["knob"].reshape(-1))
+        self.knobs: Any = self.view("knob")
         self.kernels: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {
             name: (self._bound(name, 0), self._bound(name, 1)) for name in program.recursions
         }
@@ -216,18 +217,18 @@ class Workspace:
             self.arrays[name] = whole[end - size : end].reshape(self.arrays[name].shape)
         return whole
 
-    def view(self, name: str) -> memoryview:
+    def view(self, name: str) -> Any:
         """The numbers of an array that has one row."""
         return memoryview(self.arrays[name].reshape(-1))
 
     def at(self, side: int, name: str) -> Array:
-        """An array of a point, (K + 1, ...) or (1, ...): what a kernel on that side calls `name`."""
+        """What a kernel on that side calls `name`, (K + 1, ...) or (1, ...)."""
         field = self.program.layout[name]
         array = self._sides[side][name]
         return array.reshape(len(array), *field.shape)
 
     def trajectory(self, flat: Array) -> tuple[Array, Array, Array]:
-        """x (N, n), u (K, m) and ν (q,) of a copy of one of the `trajectories`."""
+        """States (N, n), controls (K, m) and ν (q,) of a copy of one of the `trajectories`."""
         shapes = [self.arrays[name].shape for name in TRAJECTORY]
         ends = np.cumsum([rows * width for rows, width in shapes])
         x, u, nu = (

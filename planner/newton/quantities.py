@@ -53,9 +53,17 @@ class Quantities(Protocol):
         ...
 
 
+#: Derivatives of a traced problem: of what, by which symbols.
+SLOPES = {
+    "A": ("next", "x"), "B": ("next", "u"), "d_sigma": ("sigma", "x"), "d_ell": ("ell", "x"),
+    "C": ("c", "x"), "G": ("g", "x"), "H_x": ("H", "x"), "H_xx": ("H_x", "x"),
+    "row_hessians": ("C", "x"), "end_hessians": ("G", "x"),
+}  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Traced:
-    """Quantities as expressions.
+    """Quantities as expressions, and their derivatives by the names of :data:`SLOPES`.
 
     Attributes:
         graph: owner of the expressions.
@@ -91,7 +99,7 @@ class Traced:
     def dims(self) -> Dimensions:
         """Sizes."""
         return Dimensions(
-            *self.sigma.shape[:1], len(self.u), self.sigma.shape[1], len(self.c), len(self.g),
+            len(self.next), len(self.u), self.sigma.shape[1], len(self.c), len(self.g),
             max(1, len(self.numbers)),
         )  # fmt: skip
 
@@ -138,55 +146,14 @@ class Traced:
         """Itself: its symbols are the node's."""
         return self
 
-    @functools.cached_property
-    def A(self) -> Array:
-        """∂x⁺/∂x, (n, n)."""
-        return jacobian(self.next, self.x)
-
-    @functools.cached_property
-    def B(self) -> Array:
-        """∂x⁺/∂u, (n, m)."""
-        return jacobian(self.next, self.u)
-
-    @functools.cached_property
-    def d_sigma(self) -> Array:
-        """∂σ/∂x, (n, d, n)."""
-        return jacobian(self.sigma, self.x)
-
-    @functools.cached_property
-    def d_ell(self) -> Array:
-        """∂ℓ/∂x, (m, n)."""
-        return jacobian(self.ell, self.x)
-
-    @functools.cached_property
-    def C(self) -> Array:
-        """∂c/∂x, (p, n)."""
-        return jacobian(self.c, self.x)
-
-    @functools.cached_property
-    def G(self) -> Array:
-        """∂g/∂x, (q, n)."""
-        return jacobian(self.g, self.x)
-
-    @functools.cached_property
-    def H_x(self) -> Array:
-        """∂H/∂x, (n,)."""
-        return jacobian(np.array([self.H], dtype=object), self.x)[0]
-
-    @functools.cached_property
-    def H_xx(self) -> Array:
-        """∂²H/∂x², (n, n)."""
-        return jacobian(self.H_x, self.x)
-
-    @functools.cached_property
-    def row_hessians(self) -> Array:
-        """∂²c/∂x², (p, n, n)."""
-        return jacobian(self.C, self.x)
-
-    @functools.cached_property
-    def end_hessians(self) -> Array:
-        """∂²g/∂x², (q, n, n)."""
-        return jacobian(self.G, self.x)
+    def __getattr__(self, name: str) -> Array:
+        """A derivative, made when it is first asked for: see :data:`SLOPES`."""
+        if name not in SLOPES:
+            raise AttributeError(name)
+        value, symbols = SLOPES[name]
+        slopes = jacobian(np.atleast_1d(np.asarray(getattr(self, value))), getattr(self, symbols))
+        vars(self)[name] = slopes[0] if value == "H" else slopes
+        return vars(self)[name]
 
     def rows_hessian(self, weight: Array) -> Any:
         """Σ weight_o ∂²c_o/∂x², (n, n)."""

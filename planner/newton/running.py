@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.history import Columns, Iteration
 from slipcar.planner.moments.losses import floored
 from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.equations import Form
@@ -21,6 +20,7 @@ from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.feasibility import not_finite
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model
+from slipcar.planner.records import Columns, Iteration
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -95,7 +95,7 @@ def solve_mean(
         variance_weight=w,
     )  # fmt: skip
     steps = _Steps(workspace, options.callback) if history or options.callback else None
-    ending = iterate(workspace, task, MEAN, posed.filler, steps and steps.watch)
+    ending = iterate(workspace, task, MEAN, posed.filler, None if steps is None else steps.watch)
     if ending.status is None:
         raise ValueError(f"{not_finite(linearize(model, x, u))} is not finite along the guess")
     outcome = _outcome(workspace, model, ending, w, steps.columns() if steps else ())
@@ -161,7 +161,9 @@ class _Steps:
         if self._reported:
             return tuple(self._reported)
         rows, points, split = self._rows, self._points, self._workspace.trajectory
-        return Columns(lambda: _columns(rows, [split(p) for p in points]), len(rows)) if rows else ()
+        return (
+            Columns(lambda: _columns(rows, [split(p) for p in points]), len(rows)) if rows else ()
+        )
 
 
 def _columns(rows: list[StepTaken], points: list[tuple[Array, Array, Array]]) -> dict[str, Array]:
@@ -173,7 +175,7 @@ def _columns(rows: list[StepTaken], points: list[tuple[Array, Array, Array]]) ->
     }  # fmt: skip
 
 
-# ------------------------------------------------------------------------ plans that count the noise
+# --------------------------------------------------------------------- plans that count the noise
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

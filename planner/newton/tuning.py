@@ -33,8 +33,8 @@ class Tuning(NamedTuple):
         longest: a step ∫ΔuᵀRΔu dt at most, relative to the effort, or the guess's if larger.
         renewal: how much of a change of the rows' weights an iteration takes over, in (0, 1].
         least_renewal: how far it falls when steps go round in circles.
-        dearest: multipliers of the end so large beside the cost, `patience` times in a row, say that
-            it cannot be reached.
+        dearest: multipliers of the end so large beside the cost, `patience` times in a row, say
+            that it cannot be reached.
         noise: relative accuracy of the merit function.
         feasibility: what a converged plan may leave of the terminal condition, per unit of state.
         consistency: and between its mean and the path its controls lead to.

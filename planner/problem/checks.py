@@ -70,7 +70,7 @@ class Facts:
 
 
 def check(model: Model, x: Array, u: Array, facts: Facts | None, *, charged: bool) -> None:
-    """What the method assumes, by the structure of functions or, where that leaves doubt, at points.
+    """What the method assumes, by the functions' structure or, where that leaves doubt, at points.
 
     Args:
         model: the problem.

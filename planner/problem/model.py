@@ -83,7 +83,7 @@ class Model:
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @functools.cached_property
-    def R_inverse(self) -> Array:
+    def R_inverse(self) -> Array:  # noqa: N802
         """R⁻¹, (m, m)."""
         return np.linalg.inv(self.R)
 
@@ -247,12 +247,16 @@ def model_of(problem: Problem) -> Model:
         return _renewed(known[2], problem)
     model = _checked(problem)
     try:
-        reference = weakref.ref(problem, lambda _, key=id(problem): _known.pop(key, None))
+        reference = weakref.ref(problem, functools.partial(_forget, id(problem)))
     except TypeError:  # an object that cannot be referred to weakly is checked anew each time
         return model
     # The model refers to its problem: kept without it, lest the problem live for ever.
     _known[id(problem)] = (reference, named, _renewed(model, None))
     return model
+
+
+def _forget(key: int, _: Any) -> None:
+    _known.pop(key, None)
 
 
 def _signature(problem: Any) -> tuple[Any, ...]:
