@@ -9,7 +9,7 @@ ARGS ?=
 # Processes that share the episodes of `compare` and `frontier`; the numbers do not depend on it.
 # (nproc heeds OMP_NUM_THREADS, which is about threads.)
 WORKERS ?= $(shell env -u OMP_NUM_THREADS nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 1)
-# Processes that share the tests; each compiles the planner for itself where the cache is empty.
+# Processes that share the tests.
 TESTERS ?= 2
 # Options of pip for torch alone, say --index-url with the address of a CPU-only build.
 TORCH_ARGS ?=
@@ -91,9 +91,6 @@ types: $(INSTALLED)  ## mypy over the installed package
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
 compare suites frontier reproduce kills train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
-
-# Compiled once per machine, not once per renewed tree of links.
-export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba
 
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

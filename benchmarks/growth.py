@@ -181,8 +181,8 @@ def draw(curves: Sequence[Curve], folder: Path) -> list[Path]:
 def makers(scenario: Scenario) -> dict[str, Callable[[], Contender]]:
     """The best ones, by name; tolerances alike."""
     found: dict[str, Callable[[], Contender]] = {
-        "slipcar, numba": lambda: ours.numba(scenario, tolerance=ours.FINE_TOLERANCE),
-        "slipcar, NumPy/SciPy": lambda: ours.numpy(scenario, tolerance=ours.FINE_TOLERANCE),
+        "slipcar": lambda: ours.compiled(scenario, tolerance=ours.FINE_TOLERANCE),
+        "slipcar, NumPy": lambda: ours.numpy(scenario, tolerance=ours.FINE_TOLERANCE),
         "slipcar, convex scheme": lambda: ours.convex(scenario, tolerance=ours.FINE_TOLERANCE),
     }
 

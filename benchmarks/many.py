@@ -1,25 +1,27 @@
-"""`plan_batch` of 1000 start states: ms per plan, and per plan and core.
+"""`plan_batch` of 1000 start states, and of 200 new worlds: ms per plan, and per plan and core.
 
 The starts are the paper's and 999 round it: position ± 0.1 m, heading ± 0.2 rad, uniform, seeded.
-A time is that of the whole call, Python's share included: guesses, the compiled iterations, and
-1000 `Plan` objects with their covariances and multipliers.
+The worlds are random ones that the planner has never met. A time is that of the whole call,
+Python's share included: checks and traces, guesses, iterations, and the `Plan` objects with their
+covariances and multipliers.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from contenders import Answer, Contender, UnavailableError, stopwatch
-from ours import DEFAULT_TOLERANCE, FINE_TOLERANCE
+from ours import DEFAULT_TOLERANCE, FINE_TOLERANCE, FIRST_SEED, RANDOM_WORLDS
 from turns import Timing
 
 from slipcar.envs import Scenario
 from slipcar.planner import Plan, plan_batch
 
-STARTS = 1000
+STARTS, WORLDS = 1000, 200
 _NAME = "slipcar, plan_batch"
 
 
@@ -58,12 +60,32 @@ def batch(
     )
 
 
+def new_worlds(count: int = WORLDS) -> Contender:
+    """The call for so many random worlds, others each time, with `plan_batch`'s own options."""
+    for obstacles in range(1, 9):  # each kind once: what is compiled is in the cold starts
+        plan_batch([Scenario.random(FIRST_SEED, obstacles)], workers=1)
+    seeds = itertools.count(2 * FIRST_SEED)
+
+    def solve() -> tuple[float, Answer]:
+        worlds = [Scenario.random(seed) for seed in itertools.islice(seeds, count)]
+        return stopwatch(lambda: plan_batch(worlds, workers=1), _answer)()
+
+    return Contender(
+        name=f"{_NAME} of new random worlds, 1 thread, w = 1",
+        tolerance=f"step {DEFAULT_TOLERANCE:.0e}",
+        solve=solve,
+        solves=RANDOM_WORLDS,
+        plans=count,
+    )
+
+
 def makers(scenario: Scenario) -> dict[str, Callable[[], Contender]]:
-    """One thread, to the planner's own tolerance and to a finer one, and two threads."""
+    """One thread, to the planner's own tolerance and to a finer one, two threads; new worlds."""
     return {
         f"{_NAME}, 1 thread": lambda: batch(scenario, 1),
         f"{_NAME}, 1 thread, fine": lambda: batch(scenario, 1, FINE_TOLERANCE),
         f"{_NAME}, 2 threads": lambda: batch(scenario, 2),
+        f"{_NAME} of new worlds": new_worlds,
     }
 
 
@@ -73,7 +95,7 @@ def rows(timings: Sequence[Timing]) -> list[dict[str, Any]]:
         {
             "planner": timing.contender.name,
             "tolerance": timing.contender.tolerance,
-            "starts": timing.contender.plans,
+            "plans": timing.contender.plans,
             **timing.columns(),
             "ms per plan and core": timing.ms[1] * timing.contender.threads,
             "whole call [s]": float(np.median(timing.seconds)),

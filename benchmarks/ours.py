@@ -1,18 +1,20 @@
 """slipcar's own planners as contenders, called as a user calls them: one `plan` each time.
 
-Guess, iterations and the `Plan` itself are in the time. The planner remembers the problems it met
-last, checked and traced, as the other rows keep the programme they have built; a row of its own
-plans for one that it has not met, each time.
+Guess, iterations and the `Plan` itself are in the time. A problem that the planner has met is
+remembered, its numbers checked, as the other rows keep the programme they have built; rows of their
+own plan for one that it has not met, each time.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import itertools
 from collections.abc import Callable
 from typing import Any
 
 from contenders import EXACT, Answer, Contender, UnavailableError, stopwatch
+from own_problems import OwnCar
 
 from slipcar.envs import Scenario
 from slipcar.planner import Plan, Status, plan
@@ -20,36 +22,72 @@ from slipcar.planner.convex.solvers.registry import make_solver
 
 #: `plan`'s default, and one for answers as exact as those of the whole-problem solvers.
 DEFAULT_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-6
+#: Names of rows that plan for a problem never met before, each time, and what some of them solve.
+UNMET = ("slipcar, a new", "slipcar, another", "slipcar, plan_batch of new")
+RANDOM_WORLDS = "random worlds"
+#: Seeds of the random worlds: beyond those of all other benchmarks.
+FIRST_SEED = 1_000_000
 
 
-def numba(
+def compiled(
     scenario: Scenario, weight: float = 0.0, tolerance: float = DEFAULT_TOLERANCE
 ) -> Contender:
-    """The default: Newton's method, compiled with the dynamics."""
-    importlib.import_module("numba")  # its absence is noticed here
-    return planner("slipcar, numba", scenario, weight, tolerance, compiled=True)
+    """The default: Newton's method as machine code."""
+    importlib.import_module("llvmlite")  # its absence is noticed here
+    return planner("slipcar", scenario, weight, tolerance, compiled=True)
 
 
 def numpy(
     scenario: Scenario, weight: float = 0.0, tolerance: float = DEFAULT_TOLERANCE
 ) -> Contender:
-    """The same steps on NumPy and SciPy alone."""
-    return planner("slipcar, NumPy/SciPy", scenario, weight, tolerance, compiled=False)
+    """The same steps in NumPy."""
+    return planner("slipcar, NumPy", scenario, weight, tolerance, compiled=False)
 
 
 def unseen(scenario: Scenario) -> Contender:
     """The default for an equal scenario that the planner has never met, each time."""
-    importlib.import_module("numba")
     text = scenario.to_json()
+    return _of_unmet(
+        scenario, "slipcar, a new scenario each time, w = 0", lambda: Scenario.from_json(text)
+    )
+
+
+def own_class(scenario: Scenario) -> Contender:
+    """The same problem, as another object of a user's plain class each time."""
+    name = "slipcar, another object of an own class each time, w = 0"
+    return _of_unmet(scenario, name, lambda: OwnCar(scenario))
+
+
+def random_worlds(scenario: Scenario) -> Contender:
+    """Another random world each time, of one to eight obstacles; `plan`'s own options."""
+    for obstacles in range(1, 9):  # each kind once: what is compiled is in the cold starts
+        plan(Scenario.random(FIRST_SEED, obstacles))
+    seeds, converged = itertools.count(FIRST_SEED + 1), [True]
+
+    def answer(found: Plan) -> Answer:
+        converged.append(found.status is Status.CONVERGED)
+        return Answer(found.controls, found.iterations, all(converged))
 
     def solve() -> tuple[float, Answer]:
-        fresh = Scenario.from_json(text)
+        world = Scenario.random(next(seeds))
+        return stopwatch(lambda: plan(world), answer)()
+
+    return dataclasses.replace(
+        compiled(scenario, 1.0),
+        name="slipcar, a new random world each time, w = 1",
+        solve=solve,
+        solves=RANDOM_WORLDS,
+    )
+
+
+def _of_unmet(scenario: Scenario, name: str, make: Callable[[], Any]) -> Contender:
+    """The default for a problem made anew before each call."""
+
+    def solve() -> tuple[float, Answer]:
+        fresh = make()
         return stopwatch(lambda: plan(fresh, variance_weight=0.0, compiled=True), _answer)()
 
-    seen = numba(scenario)
-    return dataclasses.replace(
-        seen, name="slipcar, numba, a new scenario each time, w = 0", solve=solve
-    )
+    return dataclasses.replace(compiled(scenario), name=name, solve=solve)
 
 
 def convex(
@@ -81,13 +119,15 @@ def cvxpy(scenario: Scenario) -> Contender:
 def makers(scenario: Scenario) -> dict[str, Callable[[], Contender]]:
     """All of them on one scenario, by name."""
     return {
-        "slipcar, numba": lambda: numba(scenario),
-        "slipcar, numba, fine": lambda: numba(scenario, tolerance=FINE_TOLERANCE),
-        "slipcar, numba, w = 1": lambda: numba(scenario, 1.0),
-        "slipcar, numba, new scenario": lambda: unseen(scenario),
-        "slipcar, NumPy/SciPy": lambda: numpy(scenario),
-        "slipcar, NumPy/SciPy, fine": lambda: numpy(scenario, tolerance=FINE_TOLERANCE),
-        "slipcar, NumPy/SciPy, w = 1": lambda: numpy(scenario, 1.0),
+        "slipcar": lambda: compiled(scenario),
+        "slipcar, fine": lambda: compiled(scenario, tolerance=FINE_TOLERANCE),
+        "slipcar, w = 1": lambda: compiled(scenario, 1.0),
+        "slipcar, new scenario": lambda: unseen(scenario),
+        "slipcar, own class": lambda: own_class(scenario),
+        "slipcar, random worlds": lambda: random_worlds(scenario),
+        "slipcar, NumPy": lambda: numpy(scenario),
+        "slipcar, NumPy, fine": lambda: numpy(scenario, tolerance=FINE_TOLERANCE),
+        "slipcar, NumPy, w = 1": lambda: numpy(scenario, 1.0),
         "slipcar, convex scheme": lambda: convex(scenario),
         "slipcar, convex scheme, w = 1": lambda: convex(scenario, 1.0),
         "slipcar, OSQP in place": lambda: osqp(scenario),

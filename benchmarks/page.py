@@ -20,9 +20,9 @@ a short call follows an uncounted one of its own. Tables show the median, the qu
 fastest of the rounds. What is built once beforehand (a programme in CasADi or cvxpy) stands in a
 column of its own and is not in the time. A time of slipcar's is the whole call of `plan` on a
 problem that it has met before: guess, iterations, covariance, multipliers, and the `Plan` itself
-(a problem that it has not met is checked and traced first; a row shows that. What numba compiles,
-once in an installation, is in the table of cold starts). A time of CasADi's is the call of its
-solver. Whatever a contender believes of its answer, its controls are driven through
+(a problem that it has not met is checked and traced first: a table of its own shows that; what is
+compiled for a kind of problems, once, is in the tables of cold starts). A time of CasADi's is the
+call of its solver. Whatever a contender believes of its answer, its controls are driven through
 slipcar's own dynamics, and the cost and the miss of the goal are those of that path. Milliseconds
 belong to the machine; what carries over are ratios within a run."""
 _HOW_ENVIRONMENT = """\

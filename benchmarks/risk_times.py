@@ -31,7 +31,7 @@ ABOUT = f"""\
 The scenario `paper`, one core, contenders in turns. **starts** are guesses: 6 is the default where
 the noise has a cost, 1 the own guess alone. **risk** means that a price is searched for and the
 plan verified on 100 000 fresh paths: *ms* is the call less the Monte Carlo of both, which is in
-*Monte Carlo [s]*. **risk_price={PRICE:g}** has no Monte Carlo. **NumPy/SciPy** is
+*Monte Carlo [s]*. **risk_price={PRICE:g}** has no Monte Carlo. **NumPy** is
 `compiled=False`, the same steps. A *replan* is a step of `RecedingHorizon`: the time is that of
 `predict`, observations decoded and actions encoded, over all replans of an episode ({EPISODES}
 episodes in one call in a batch).
@@ -60,12 +60,12 @@ def makers(scenario: Scenario, simulated: Simulated) -> dict[str, Callable[[], C
         found[name] = lambda: planner(name, scenario, options, simulated)
 
     add(_BASE, {"compiled": True})
-    add(f"{_BASE}, NumPy/SciPy", {"compiled": False})
+    add(f"{_BASE}, NumPy", {"compiled": False})
     for name, options in _CASES.items():
         add(name, {**options, "compiled": True})
         add(f"{name}, starts=1", {**options, "compiled": True, "starts": 1})
         if "risk" not in options:  # the search solves at some prices, each as with risk_price
-            add(f"{name}, NumPy/SciPy", {**options, "compiled": False})
+            add(f"{name}, NumPy", {**options, "compiled": False})
     for price, title in ((0.0, "replan"), (PRICE, f"replan, risk_price={PRICE:g}")):
         found[f"{title}, single"] = _replans(f"{title}, single", scenario, price, 1)
         batch = f"{title}, {EPISODES} episodes"
@@ -78,7 +78,7 @@ def planner(
 ) -> Contender:
     """`plan` with these options, its Monte Carlo apart."""
     if options.get("compiled"):
-        importlib.import_module("numba")  # its absence is noticed here
+        importlib.import_module("llvmlite")  # its absence is noticed here
 
     def solve() -> tuple[float, Answer]:
         found = plan(scenario, **options)

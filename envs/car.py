@@ -4,13 +4,13 @@
     b(x, u) = (v cos θ, v sin θ, ω, a_v, a_ω)
     σ(x)    = ω v diag(α², α², β²) on (r_x, r_y, θ), zero on (v, ω)
 
-(paper §6.3, SPEC §2). Noise is zero when the car stands or drives straight. The part
+(paper §6.3). Noise is zero when the car stands or drives straight. The part
 z = (v, ω) is never reached by the noise, so in open loop it is deterministic. A scenario may add
 process noise: constant columns p_i e_i, each driven by a Brownian motion of its own.
 
 `rates` and `slip_rates` are the two equations, on components (:mod:`slipcar.envs.arrays`).
 The other functions put them into arrays, batched over leading axes and following the array API:
-NumPy and Torch arrays go in, the same kind comes out; complex arrays pass through (complex-step).
+NumPy and Torch arrays go in, the same kind comes out; so do arrays of complex numbers or symbols.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 from slipcar.envs.arrays import array_namespace
 
 #: State, control and Brownian dimensions. Slip has three non-zero rows, so three Brownian
-#: motions drive it; SPEC's 5 x 5 diagonal is this matrix with two zero columns dropped.
+#: motions drive it; the paper's 5 x 5 diagonal is this matrix with two zero columns dropped.
 #: (Process noise, where a scenario has any, adds one for every state that it reaches.)
 STATE_DIM, CONTROL_DIM, NOISE_DIM = 5, 2, 3
 STATE_NAMES = ("r_x", "r_y", "θ", "v", "ω")
@@ -56,7 +56,7 @@ def drift(x: Any, u: Any) -> Any:
         u: controls, (..., 2) [m/s², rad/s²].
 
     Returns:
-        b(x, u), (..., 5). SPEC §2.
+        b(x, u), (..., 5); paper §6.3.
     """
     xp = array_namespace(x, u)
     theta, v = x[..., 2], x[..., 3]
@@ -81,34 +81,19 @@ def drift_jacobian(x: Any, u: Any) -> tuple[Any, Any]:
     return A, B
 
 
-def slip_intensity(x: Any, slip: Any) -> Any:
-    """Standard deviation per √s of the noise on (r_x, r_y, θ): ω v (α², α², β²).
-
-    Args:
-        x: states, (..., 5).
-        slip: (α², β²).
-
-    Returns:
-        The non-zero diagonal of σ(x), signed, (..., 3).
-    """
-    xp = array_namespace(x)
-    position, heading = slip_rates(x[..., 3], x[..., 4], slip[0], slip[1])
-    return xp.stack([position, position, heading], axis=-1)
-
-
 def diffusion(x: Any, slip: Any, process: Sequence[tuple[int, float]] = ()) -> Any:
     """Diffusion matrix σ(x), (..., 5, 3 + p).
 
     Args:
         x: states, (..., 5).
-        slip: (α², β²); see :func:`slip_intensity`.
+        slip: (α², β²); see :func:`slip_rates`.
         process: p pairs (component of the state, standard deviation per √s).
     """
     xp = array_namespace(x)
-    scale = slip_intensity(x, slip)
+    position, heading = slip_rates(x[..., 3], x[..., 4], slip[0], slip[1])
     sigma = xp.zeros((*x.shape[:-1], STATE_DIM, NOISE_DIM + len(process)), dtype=x.dtype)
-    for i in range(NOISE_DIM):
-        sigma[..., i, i] = scale[..., i]
+    for i, scale in enumerate((position, position, heading)):
+        sigma[..., i, i] = scale
     for column, (i, deviation) in enumerate(process, start=NOISE_DIM):
         sigma[..., i, column] = deviation
     return sigma

@@ -337,7 +337,7 @@ class Scenario:
         return self.goal_weight
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """The numbers in the functions above, so that planners compile them once for all."""
+        """The numbers in the functions above: one trace of a planner's serves all scenarios."""
         return {
             "obstacles": self.obstacles,
             "clearance": np.asarray(self.clearance),
@@ -372,7 +372,7 @@ class Scenario:
     def initial_guess(self) -> tuple[np.ndarray, np.ndarray]:
         """The straight line with its heading and speed: states (N, 5) and zero controls.
 
-        A guess with θ = v = 0 along the line leaves r_y uncontrollable (SPEC §2, "start").
+        A guess with θ = v = 0 along the line leaves r_y uncontrollable (docs/reproduction.md).
         """
         return self._straight_line.copy(), np.zeros((self.nodes - 1, car.CONTROL_DIM))
 

@@ -31,7 +31,7 @@ from slipcar.planner import Feedback, OpenLoop
 FORMAT = 2
 _SCALARS = tuple(f.name for f in dataclasses.fields(Measured) if f.name != "metrics")
 #: Whose versions count: for planners, and for what may use anything.
-_PLANNING = ("numpy", "scipy", "numba")
+_PLANNING = ("numpy", "scipy", "llvmlite")
 _ANY = (*_PLANNING, "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "cvxpy", "osqp")
 
 

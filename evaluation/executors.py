@@ -36,7 +36,7 @@ ANSWER, WITHOUT_WORKERS = 10.0, 60.0
 #: What `cluster` may be, for messages and help.
 CLUSTERS = "loky, dask (local Dask workers), dask://HOST:PORT or dask+tls://HOST:PORT"
 #: Packages whose versions must agree between this process and a cluster's workers.
-_SAME = ("slipcar", "numpy", "scipy", "numba")
+_SAME = ("slipcar", "numpy", "scipy", "llvmlite")
 
 _alone = threading.Lock()
 

@@ -16,7 +16,7 @@ from typing import Any
 PACKAGES = (
     "slipcar", "numpy", "scipy", "pandas", "gymnasium", "array-api-compat", "safetensors",
     "joblib", "distributed", "matplotlib", "torch", "stable-baselines3", "sb3-contrib", "osqp",
-    "cvxpy", "numba",
+    "cvxpy", "llvmlite",
 )  # fmt: skip
 _FOLDERS = ("envs", "planner", "baselines", "evaluation")
 

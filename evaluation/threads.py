@@ -9,9 +9,7 @@ from collections.abc import Iterator
 import threadpoolctl
 
 #: What libraries read when they are loaded; for processes that have not loaded them yet.
-ENVIRONMENT = {
-    f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")
-}
+ENVIRONMENT = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")}
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
     python examples/boat.py
 
 The class below is all that the planner needs: drift, diffusion, terminal condition and costs as
-functions batched over leading axes. Jacobians are found by the complex step.
+functions batched over leading axes. They are traced and differentiated exactly, by the planner.
 """
 
 from __future__ import annotations

@@ -11,13 +11,11 @@ and `cvxpy` backends import their packages when used.
 from slipcar.planner.batch import plan_batch
 from slipcar.planner.controllers import Feedback, OpenLoop
 from slipcar.planner.extremal.certificate import Certificate
-from slipcar.planner.history import Iteration
-from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.plan import Plan
 from slipcar.planner.planning import plan
 from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.receding_horizon import RecedingHorizon
-from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
+from slipcar.planner.records import Alternative, ExpectedCost, Iteration, Multipliers, TimeStep
 from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
 

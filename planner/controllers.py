@@ -13,13 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.moments.gains import (
-    closed_loop_covariance,
-    default_tracking,
-    lqr_gains,
-    weight_matrix,
-    wrap,
-)
+from slipcar.planner.moments import gains as tracking
+from slipcar.planner.moments.gains import closed_loop_covariance, weight_matrix, wrap
 from slipcar.planner.plan import Plan
 from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
 from slipcar.planner.problem.model import model_of
@@ -68,17 +63,10 @@ class OpenLoop:
         Raises:
             ValueError: if the observation has the wrong length or is not finite.
         """
-        t, x = self._decode(observation)
-        u = self.control(t, x)
-        encode = getattr(self.plan.problem, "encode_control", None)
-        return np.asarray(u if encode is None else encode(u), dtype=np.float32), None
+        return self._action(self.control(*self._decode(observation))), None
 
     def preview(self, state: Any = None, row: int = 0) -> tuple[Array, Array | None]:
-        """What it means to do, to be drawn: the whole plan, whatever has happened.
-
-        Args:
-            state: what `predict` returned.
-            row: which episode of those `predict` was asked for.
+        """What episode `row` of those with the `state` means to do, to be drawn: the whole plan.
 
         Returns:
             Mean states (N, n), and the covariances (N, n, n) of the car driven so: open loop or,
@@ -94,15 +82,19 @@ class OpenLoop:
         return digest.hexdigest()
 
     def _numbers(self) -> list[Array]:
-        return [self.plan.times, self.plan.controls, *self._limits()]
+        lower, upper, radius = self._limits()
+        angles = np.asarray(getattr(self.plan.problem, "angles", ()), dtype=np.int64)
+        return [self.plan.times, self.plan.controls, lower, upper, np.array([radius]), angles]
 
-    def _limits(self) -> list[Array]:
-        """What the problem does to controls on their way to actions."""
+    def _limits(self) -> tuple[Array, Array, float]:
+        """Lower and upper bounds and the ball's radius, of the plan's problem."""
         problem, m = self.plan.problem, self.plan.controls.shape[1]
         bounds = control_limits(getattr(problem, "control_bounds", None), m)
-        radius = control_ball(getattr(problem, "control_radius", None), *bounds)
-        angles = np.asarray(getattr(problem, "angles", ()), dtype=np.int64)
-        return [*bounds, np.array([radius]), angles]
+        return *bounds, control_ball(getattr(problem, "control_radius", None), *bounds)
+
+    def _action(self, u: Array) -> Array:
+        encode = getattr(self.plan.problem, "encode_control", None)
+        return np.asarray(u if encode is None else encode(u), dtype=np.float32)
 
     def _interval(self, t: Any) -> Array:
         # Observations are float32, so a node's time may come back a little early.
@@ -152,23 +144,19 @@ class Feedback(OpenLoop):
         gains = plan.gains
         if gains is None:
             own = getattr(plan.problem, "control_weight", np.eye(m))
-            gains = lqr_gains(
-                plan.A,
-                plan.B,
-                np.diff(plan.times),
-                weight_matrix("Q", default_tracking(n) if Q is None else Q, n),
+            weights = (
+                weight_matrix("Q", tracking.default_tracking(n) if Q is None else Q, n),
                 weight_matrix("R", own if R is None else R, m, definite=True),
                 weight_matrix("Qf", Qf, n),
             )
+            gains = tracking.lqr_gains(plan.A, plan.B, np.diff(plan.times), *weights)
         gains = np.asarray(gains, dtype=np.float64)
         wanted = (len(plan.controls), m, n)
         if gains.shape != wanted or not np.isfinite(gains).all():
             raise ValueError(f"gains must be finite and of shape {wanted}, not {gains.shape}")
         super().__init__(plan.replace(gains=gains))
         self._angles = tuple(getattr(plan.problem, "angles", ()))
-        bounds = control_limits(getattr(plan.problem, "control_bounds", None), m)
-        radius = control_ball(getattr(plan.problem, "control_radius", None), *bounds)
-        self._admissible = (*bounds, radius)
+        self._admissible = self._limits()
 
     def control(self, t: Any, x: Any) -> Array:
         """Control in physical units at times t (...,) [s] and states x (..., n): (..., m)."""

@@ -10,10 +10,8 @@ import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solver
 from slipcar.planner.convex.trust_region import TRUST_REGIONS
-from slipcar.planner.history import Iteration
 from slipcar.planner.problem.integrators import INTEGRATORS
-
-METHODS = ("auto", "newton", "convex")
+from slipcar.planner.records import Iteration
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,9 +19,9 @@ class Options:
     """How an iteration runs.
 
     Attributes:
-        variance_weight: w ≥ 0 of w ∫ tr Σ dt; 0 is deterministic SCP. In `plan`, None is 1, or 0 with
-            one of `risk`, `risk_price`, `feedback` and `expected`, whose cost counts the noise
-            already. Without one of them, w > 0 asks for a diffusion that depends on no uncertain
+        variance_weight: w ≥ 0 of w ∫ tr Σ dt; 0 is deterministic SCP. In `plan`, None is 1, or 0
+            with one of `risk`, `risk_price`, `feedback` and `expected`, whose cost counts the
+            noise already. Without them, w > 0 asks for a diffusion that depends on no uncertain
             state.
         solver: of the convex method: `"structured"`, `"osqp"` or `"cvxpy"`, or an object with
             their interface; see :mod:`slipcar.planner.convex.solvers`.
@@ -71,28 +69,26 @@ class Options:
         check_number("tolerance", self.tolerance)
         check_number("terminal_tolerance", self.terminal_tolerance, zero_allowed=True)
         check_count("max_iterations", self.max_iterations)
-        check_choice("method", self.method, METHODS)
+        check_choice("method", self.method, ("auto", "newton", "convex"))
         if self.trust_region is not None:
             check_choice("trust_region", self.trust_region, TRUST_REGIONS)
         check_choice("linearization", self.linearization, ("composite", "literal"))
         check_choice("integrator", self.integrator, INTEGRATORS)
-        if self.compiled not in (None, True, False):
-            raise ValueError(f"compiled must be None, True or False, not {self.compiled!r}")
+        check_flag("compiled", self.compiled, none_allowed=True)
         if self.callback is not None and not callable(self.callback):
             raise ValueError(f"callback must be a function of an Iteration, not {self.callback!r}")
         if not isinstance(self.solver, str) and not hasattr(self.solver, "solve"):
             raise ValueError(
                 f"solver must be a name or an object with solve(subproblem), not {self.solver!r}"
             )
-        convex = self.only_convex or ("method='convex'" if self.method == "convex" else "")
-        if self.compiled and convex:
+        if self.compiled and self.convex:
             raise ValueError(
-                f"compiled=True is of Newton's method, which cannot be combined with {convex}: "
-                f"leave compiled out"
+                f"compiled=True is of Newton's method, which cannot be combined with "
+                f"{self.convex}: leave compiled out"
             )
-        if self.method == "newton" and self.only_convex:
+        if self.method == "newton" and self.convex:
             raise ValueError(
-                f"method='newton' cannot be combined with {self.only_convex}: "
+                f"method='newton' cannot be combined with {self.convex}: "
                 f"method='convex' can (or leave method out)"
             )
 
@@ -103,7 +99,7 @@ class Options:
         return copy
 
     @property
-    def only_convex(self) -> str:
+    def convex(self) -> str:
         """The option that asks for exact convex sub-problems, in words; empty if none does."""
         if self.solver != "structured":
             return f"solver={self.solver!r}"
@@ -113,23 +109,16 @@ class Options:
             return f"linearization={self.linearization!r}"
         if self.terminal_tolerance > 0.0:
             return f"terminal_tolerance={self.terminal_tolerance:g}"
-        return ""
+        return "method='convex'" if self.method == "convex" else ""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, to be kept with a plan."""
-        solver = self.solver if isinstance(self.solver, str) else type(self.solver).__name__
-        return {
-            "variance_weight": float(self.variance_weight),
-            "solver": solver,
-            "method": self.method,
-            "tolerance": float(self.tolerance),
-            "max_iterations": int(self.max_iterations),
-            "trust_region": self.trust_region,
-            "linearization": self.linearization,
-            "terminal_tolerance": float(self.terminal_tolerance),
-            "integrator": self.integrator,
-            "compiled": self.compiled,
-        }
+        data = {name: value for name, value in vars(self).items() if name != "callback"}
+        for name in ("variance_weight", "tolerance", "terminal_tolerance"):
+            data[name] = float(data[name])
+        if not isinstance(self.solver, str):
+            data["solver"] = type(self.solver).__name__
+        return data | {"max_iterations": int(self.max_iterations)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,8 +168,7 @@ class Guesses:
         if self.starts is not None:
             check_count("starts", self.starts)
         check_choice("cold_start", self.cold_start, ("auto", "always", "never"))
-        if self.free_first not in (None, True, False):
-            raise ValueError(f"free_first must be None, True or False, not {self.free_first!r}")
+        check_flag("free_first", self.free_first, none_allowed=True)
         if (self.starts or 1) > 1 and self.guess is not None:
             raise ValueError(
                 "starts > 1 and guess exclude each other: starts makes its own guesses"
@@ -193,6 +181,13 @@ def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
     """Raise ValueError unless the value is one of the known ones."""
     if not isinstance(value, str) or value not in (known := list(known)):
         raise ValueError(f"unknown {name} {value!r}; known: {list(known)}")
+
+
+def check_flag(name: str, value: Any, *, none_allowed: bool = False) -> None:
+    """Raise ValueError unless the value is a truth value (or None)."""
+    if value not in ((None, True, False) if none_allowed else (True, False)):
+        known = "None, True or False" if none_allowed else "True or False"
+        raise ValueError(f"{name} must be {known}, not {value!r}")
 
 
 def check_number(name: str, value: Any, *, zero_allowed: bool = False) -> None:

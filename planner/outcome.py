@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from slipcar.planner.history import Iteration
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
+from slipcar.planner.records import Iteration
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -18,42 +19,23 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Outcome:
-    """The last iterate and its multipliers.
-
-    Attributes:
-        status: how it ended.
-        x: states, (N, n).
-        u: controls, (K, m).
-        A: ∂x⁺/∂x there, (K, n, n).
-        B: ∂x⁺/∂u, (K, n, m).
-        covariance: Σ, (N, n, n).
-        effort: Σ dt uᵀRu.
-        penalty: Σ dt Σ w max(0, c)².
-        running: Σ dt (H + ℓᵀu).
-        adjoint: λ_1..λ_K of the last accepted step, (K, n).
-        terminal: ν, (q,).
-        trust_multiplier: −p¹ of it.
-        iterations: sub-problems solved.
-        history: each of them; empty where it was not kept.
-        objective: effort, penalty, running cost and w ∫ tr Σ dt.
-        message: what is lacking when infeasible; the solver's own words when it failed.
-    """
+    """The last iterate and its multipliers; what is not described is as in a plan."""
 
     status: Status
-    x: Array
-    u: Array
+    x: Array  #: mean, (N, n)
+    u: Array  #: controls, (K, m)
     A: Array
     B: Array
     covariance: Array
     effort: float
-    penalty: float
-    running: float
-    adjoint: Array
-    terminal: Array
-    trust_multiplier: float
+    penalty: float  #: a plan's obstacle_cost
+    running: float  #: a plan's running_cost
+    adjoint: Array  #: λ_1..λ_K of the last accepted step, (K, n)
+    terminal: Array  #: ν, (q,)
+    trust_multiplier: float  #: −p¹ of that step
     iterations: int
-    history: Sequence[Iteration]
-    objective: float
+    history: Sequence[Iteration]  #: empty where it was not kept
+    objective: float  #: effort, penalty, running cost and w ∫ tr Σ dt
     message: str = ""
 
     @classmethod
@@ -63,34 +45,23 @@ class Outcome:
         model: Model,
         variance_weight: float,
         *,
-        status: Status,
-        adjoint: Array,
-        terminal: Array,
         history: Sequence[Iteration],
         trust_multiplier: float = 0.0,
-        message: str = "",
+        **others: Any,
     ) -> Outcome:
-        """What is known where an iteration ended, from its linearisation there."""
+        """What is known from a linearisation; `others`: status, adjoint, terminal, message."""
         S = moments.covariance_of(model, lin)
-        variance = variance_weight * moments.trace_integral(S, model.dt)
+        names = ("x", "u", "A", "B", "effort", "penalty", "running")
         return cls(
-            status=status,
-            x=lin.x,
-            u=lin.u,
-            A=lin.A,
-            B=lin.B,
+            **{name: getattr(lin, name) for name in names},
             covariance=S,
-            effort=lin.effort,
-            penalty=lin.penalty,
-            running=lin.running,
-            adjoint=adjoint,
-            terminal=terminal,
             trust_multiplier=trust_multiplier,
             iterations=len(history),
             history=history,
-            objective=lin.effort + lin.penalty + lin.running + variance,
-            message=message,
-        )
+            objective=lin.effort + lin.penalty + lin.running
+            + variance_weight * moments.trace_integral(S, model.dt),
+            **others,
+        )  # fmt: skip
 
     def said(self, words: str) -> Outcome:
         """The same with more to say."""

@@ -14,16 +14,13 @@ import numpy as np
 from slipcar.planner import plan_file
 from slipcar.planner.extremal.certificate import Certificate, certify
 from slipcar.planner.extremal.shooting import Shot
-from slipcar.planner.history import Iteration
 from slipcar.planner.moments.covariance import trace_integral
-from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.newton.running import Steered
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model, penalty_cost
 from slipcar.planner.problem.protocol import Problem
-from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
+from slipcar.planner.records import Alternative, ExpectedCost, Iteration, Multipliers, TimeStep
 from slipcar.planner.search.risk import Risk
-from slipcar.planner.search.steering import Steering
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -31,63 +28,42 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """Open-loop controls, the mean they steer and the covariance predicted around it.
+    """Open-loop controls, the mean they steer and the covariance predicted around it."""
 
-    Attributes:
-        status: how planning ended; only CONVERGED is an answer.
-        times: nodes, (N,) [s].
-        mean: μ, (N, n), in the units of the problem's state.
-        controls: u, (N−1, m), constant on each interval.
-        covariance: Σ, (N, n, n); the first is the problem's `start_covariance`, zero by default.
-        effort: Σ dt uᵀRu.
-        obstacle_cost: Σ dt Σ w max(0, c(μ))².
-        running_cost: Σ dt (H(μ) + ℓ(μ)ᵀu), the problem's smooth running costs.
-        variance: ∫ tr Σ dt.
-        iterations: sub-problems solved.
-        history: one :class:`Iteration` for each.
-        guess: states the iteration started from, (N, n).
-        multipliers: of the last sub-problem.
-        A: Jacobians ∂x⁺/∂x of the integrator's steps along the plan, I + dt ∂b/∂x for Euler's,
-            (N−1, n, n).
-        B: ∂x⁺/∂u, dt ∂b/∂u for Euler's, (N−1, n, m).
-        gains: feedback gains, (N−1, m, n), or None.
-        solve_time: wall-clock seconds of `plan`, callback included.
-        options: what `plan` was called with.
-        problem: the problem planned for; None after loading if it could not be saved.
-        message: what is lacking, the solver's own words if it failed, which guess was taken.
-        alternatives: what became of each guess, the best first, when there were several starts.
-        time_search: every horizon tried, when the final time was free.
-        shot: the last attempt at shooting, when it was asked for and one was made; not saved.
-        expected: what the plan costs in expectation, when it was made for that: with `risk`,
-            `risk_price`, `feedback` or `expected`. The history is then that of the plan of the
-            mean it started from, and `covariance` is that of the closed loop.
-        risk: requested, predicted and verified probability of a violation, when one was asked for.
-    """
-
-    status: Status
-    times: Array
-    mean: Array
-    controls: Array
+    status: Status  #: how planning ended; only CONVERGED is an answer
+    times: Array  #: nodes, (N,) [s]
+    mean: Array  #: μ, (N, n), in the units of the problem's state
+    controls: Array  #: u, (N−1, m), constant on each interval
+    #: Σ, (N, n, n); the first is the problem's `start_covariance`, zero by default
     covariance: Array
-    effort: float
-    obstacle_cost: float
-    running_cost: float
-    variance: float
-    iterations: int
-    history: Sequence[Iteration]
-    guess: Array
-    multipliers: Multipliers
+    effort: float  #: Σ dt uᵀRu
+    obstacle_cost: float  #: Σ dt Σ w max(0, c(μ))²
+    running_cost: float  #: Σ dt (H(μ) + ℓ(μ)ᵀu), the problem's smooth running costs
+    variance: float  #: ∫ tr Σ dt
+    iterations: int  #: sub-problems solved
+    history: Sequence[Iteration]  #: one :class:`Iteration` for each
+    guess: Array  #: states the iteration started from, (N, n)
+    multipliers: Multipliers  #: of the last sub-problem
+    #: Jacobians ∂x⁺/∂x of the integrator's steps along the plan, I + dt ∂b/∂x for Euler's, (N−1,
+    #: n, n)
     A: Array
-    B: Array
-    gains: Array | None
-    solve_time: float
-    options: dict[str, Any]
-    problem: Problem | None
+    B: Array  #: ∂x⁺/∂u, dt ∂b/∂u for Euler's, (N−1, n, m)
+    gains: Array | None  #: feedback gains, (N−1, m, n), or None
+    solve_time: float  #: wall-clock seconds of `plan`, callback included
+    options: dict[str, Any]  #: what `plan` was called with
+    problem: Problem | None  #: the problem planned for; None after loading if it could not be saved
+    #: what is lacking, the solver's own words if it failed, which guess was taken
     message: str = ""
+    #: what became of each guess, the best first, when there were several starts
     alternatives: tuple[Alternative, ...] = ()
-    time_search: tuple[TimeStep, ...] = ()
+    time_search: tuple[TimeStep, ...] = ()  #: every horizon tried, when the final time was free
+    #: the last attempt at shooting, when it was asked for and one was made; not saved
     shot: Shot | None = None
+    #: what the plan costs in expectation, when it was made for that: with `risk`, `risk_price`,
+    #: `feedback` or `expected`. The history is then that of the plan of the mean it started from,
+    #: and `covariance` is that of the closed loop.
     expected: ExpectedCost | None = None
+    #: requested, predicted and verified probability of a violation, when one was asked for
     risk: Risk | None = None
 
     @property
@@ -148,82 +124,40 @@ class Plan:
         return cls(**plan_file.read(path))
 
 
-def steered_plan(
-    steering: Steering,
-    nominal: Outcome,
-    model: Model,
-    problem: Problem,
-    *,
-    guess: Array,
-    options: dict[str, Any],
-    seconds: float,
-    **extras: Any,
-) -> Plan:
-    """A plan of an expected cost, which started from the plan of the mean `nominal`."""
-    of_mean = plan_of(
-        nominal, model, problem, guess=guess, options=options, seconds=seconds, **extras
-    )
-    return of_mean.replace(
-        **steered_fields(steering.plan, model),
-        status=steering.status,
-        iterations=nominal.iterations + steering.iterations,
-        gains=steering.plan.gains if options["feedback"] else None,
-        message=steering.message,
-        expected=steering.cost,
-        risk=steering.risk,
+def plan_of(outcome: Outcome, model: Model, problem: Problem, **others: Any) -> Plan:
+    """A plan of what `outcome` found for `model`, which completes `problem`."""
+    return Plan(
+        **fields_of(outcome, model, outcome.penalty, outcome.trust_multiplier),
+        times=model.times,
+        iterations=outcome.iterations,
+        history=outcome.history,
+        gains=None,
+        problem=problem,
+        message=outcome.message,
+        **others,
     )
 
 
-def steered_fields(steered: Steered, model: Model) -> dict[str, Any]:
-    """What a plan takes over from where an iteration on an expected cost ended."""
+def fields_of(
+    ended: Outcome | Steered, model: Model, obstacle_cost: float, trust_multiplier: float = 0.0
+) -> dict[str, Any]:
+    """What a plan takes over from where an iteration ended."""
+    multipliers = Multipliers.of(ended.adjoint, ended.terminal, trust_multiplier, ended.A)
     return {
-        "mean": steered.x,
-        "controls": steered.u,
-        "covariance": steered.covariance,
-        "effort": steered.effort,
-        "obstacle_cost": penalty_cost(model, steered.x),
-        "running_cost": steered.running,
-        "variance": trace_integral(steered.covariance, model.dt),
-        "multipliers": Multipliers.of(steered.adjoint, steered.terminal, 0.0, steered.A),
-        "A": steered.A,
-        "B": steered.B,
+        "status": ended.status,
+        "mean": ended.x,
+        "controls": ended.u,
+        "covariance": ended.covariance,
+        "effort": ended.effort,
+        "obstacle_cost": obstacle_cost,
+        "running_cost": ended.running,
+        "variance": trace_integral(ended.covariance, model.dt),
+        "multipliers": multipliers,
+        "A": ended.A,
+        "B": ended.B,
     }
 
 
-def plan_of(
-    outcome: Outcome,
-    model: Model,
-    problem: Problem,
-    *,
-    guess: Array,
-    options: dict[str, Any],
-    seconds: float,
-    gains: Array | None = None,
-    **more: Any,
-) -> Plan:
-    """A plan: what `outcome` found for `model`, which completes `problem`, from states `guess`."""
-    return Plan(
-        status=outcome.status,
-        times=model.times,
-        mean=outcome.x,
-        controls=outcome.u,
-        covariance=outcome.covariance,
-        effort=outcome.effort,
-        obstacle_cost=outcome.penalty,
-        running_cost=outcome.running,
-        variance=trace_integral(outcome.covariance, model.dt),
-        iterations=outcome.iterations,
-        history=outcome.history,
-        guess=guess,
-        multipliers=Multipliers.of(
-            outcome.adjoint, outcome.terminal, outcome.trust_multiplier, outcome.A
-        ),
-        A=outcome.A,
-        B=outcome.B,
-        gains=gains,
-        solve_time=seconds,
-        options=options,
-        problem=problem,
-        message=outcome.message,
-        **more,
-    )
+def steered_fields(steered: Steered, model: Model) -> dict[str, Any]:
+    """The same for an iteration on an expected cost, and its gains."""
+    return fields_of(steered, model, penalty_cost(model, steered.x)) | {"gains": steered.gains}

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.history import Columns, Iteration
-from slipcar.planner.multipliers import Multipliers
-from slipcar.planner.problem.protocol import Problem
-from slipcar.planner.records import Alternative, ExpectedCost, TimeStep
+from slipcar.planner import records
+from slipcar.planner.records import Columns, Iteration
 from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
 
@@ -27,6 +25,7 @@ _ARRAYS = ("times", "mean", "controls", "covariance", "guess", "A", "B", "gains"
 _SCALARS = (
     "effort", "obstacle_cost", "running_cost", "variance", "iterations", "solve_time", "message",
 )  # fmt: skip
+_COLUMNS = [field.name for field in dataclasses.fields(Iteration)]
 
 
 def write(plan: Any, path: str | os.PathLike[str]) -> Path:
@@ -34,13 +33,9 @@ def write(plan: Any, path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if path.suffix != ".npz":
         path = path.with_name(path.name + ".npz")
-    arrays: dict[str, Any] = {
-        name: getattr(plan, name) for name in _ARRAYS if getattr(plan, name) is not None
-    }
+    arrays = {name: getattr(plan, name) for name in _ARRAYS if getattr(plan, name) is not None}
     arrays |= {f"multipliers.{k}": v for k, v in plan.multipliers.as_dict().items()}
-    if len(plan.history):
-        columns = Columns.of(plan.history).columns
-        arrays |= {f"history.{name}": column for name, column in columns.items()}
+    arrays |= {f"history.{k}": v for k, v in _columns(plan.history).items()}
     header = {
         "format": _FORMAT,
         "status": plan.status.name,
@@ -83,46 +78,52 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
             **{name: header[name] for name in _SCALARS},
             "gains": arrays.get("gains"),
             "status": Status[header["status"]],
-            "history": _history_from(arrays),
-            "multipliers": Multipliers.from_dict(_strip(arrays, "multipliers.")),
+            "history": _history(_strip(arrays, "history.")),
+            "multipliers": records.Multipliers.from_dict(_strip(arrays, "multipliers.")),
             "options": header["options"],
             "problem": _problem_from_data(header["problem"]),
             "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
-            "time_search": tuple(TimeStep(**row) for row in header["time_search"]),
-            "expected": ExpectedCost(**header["expected"]) if header.get("expected") else None,
+            "time_search": tuple(records.TimeStep(**row) for row in header["time_search"]),
+            "expected": records.ExpectedCost(**header["expected"])
+            if header.get("expected")
+            else None,
             "risk": Risk.from_dict(header["risk"]) if header.get("risk") else None,
         }
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a plan or is damaged: {error!r}") from error
 
 
-def _alternative(row: dict[str, Any]) -> Alternative:
+def _alternative(row: dict[str, Any]) -> records.Alternative:
     kind = row["homotopy"]
     kind = tuple(kind) if isinstance(kind, list) else kind
-    return Alternative(**{**row, "status": Status[row["status"]], "homotopy": kind})
+    return records.Alternative(**{**row, "status": Status[row["status"]], "homotopy": kind})
 
 
 def _strip(arrays: dict[str, Array], prefix: str) -> dict[str, Array]:
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
-def _history_from(arrays: dict[str, Array]) -> Sequence[Iteration]:
-    columns = _strip(arrays, "history.")
-    if not columns:
+def _columns(history: Sequence[Iteration]) -> dict[str, Array]:
+    if not history:
+        return {}
+    if isinstance(history, Columns):
+        return history.columns
+    return {name: np.stack([getattr(row, name) for row in history]) for name in _COLUMNS}
+
+
+def _history(columns: dict[str, Array]) -> Sequence[Iteration]:
+    if missing := set(_COLUMNS) - set(columns):
+        if columns:
+            raise KeyError(f"history: {sorted(missing)}")
         return ()
-    if missing := {field.name for field in dataclasses.fields(Iteration)} - set(columns):
-        raise KeyError(f"history: {sorted(missing)}")
     return Columns(columns)
 
 
-def _problem_to_data(problem: Problem | None) -> dict[str, str] | None:
-    to_json = getattr(problem, "to_json", None)
-    if to_json is None:
-        return None
-    cls = type(problem)
-    for entry in entry_points(group="slipcar.problems"):
-        if entry.value == f"{cls.__module__}:{cls.__qualname__}":
-            return {"class": entry.name, "json": to_json()}
+def _problem_to_data(problem: Any) -> dict[str, str] | None:
+    kind = f"{type(problem).__module__}:{type(problem).__qualname__}"
+    for entry in entry_points(group="slipcar.problems") if hasattr(problem, "to_json") else ():
+        if entry.value == kind:
+            return {"class": entry.name, "json": problem.to_json()}
     return None
 
 

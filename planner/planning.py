@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,16 +9,15 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solver
-from slipcar.planner.history import Iteration
-from slipcar.planner.newton.posing import Posed, check_assumptions, pose
+from slipcar.planner.newton.posing import Posed
 from slipcar.planner.options import Guesses, Options
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.plan import Plan, plan_of, steered_plan
-from slipcar.planner.problem import checks
-from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.plan import Plan, plan_of, steered_fields
+from slipcar.planner.problem.checks import check_derivatives as compare_derivatives
 from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.problem.reposed import reposed
-from slipcar.planner.search.attempt import attempt, uses_newton
+from slipcar.planner.records import Iteration
+from slipcar.planner.search.attempt import Task, attempt, completed, posed_for
 from slipcar.planner.search.free_time import checked_bounds
 from slipcar.planner.search.free_time import free_final_time as search_time
 from slipcar.planner.search.shot import solve_shooting
@@ -68,16 +66,12 @@ def plan(
 
         minimise  ∫ uᵀRu + H(μ) + ℓ(μ)ᵀu + Σ w max(0, c(μ))² + variance_weight · tr Σ dt
 
-    Args:
-        problem: anything that satisfies :class:`slipcar.planner.Problem`; a Scenario does.
-        variance_weight, solver, method, tolerance, max_iterations, trust_region, linearization,
-            terminal_tolerance, integrator, compiled, callback: how the iteration runs; each is
-            described at :class:`slipcar.planner.options.Options`.
-        starts, guess, cold_start, free_first, shooting, free_final_time, time_weight,
-            final_time_bounds, check_derivatives: where it begins and which horizons it tries; see
-            :class:`slipcar.planner.options.Guesses`.
-        risk, risk_price, risk_episodes, feedback, expected, terminal_weight: what is planned for
-            beyond the mean; see :class:`slipcar.planner.search.steering.Request`.
+    Any object that satisfies :class:`slipcar.planner.Problem` can be planned for; a Scenario does.
+    How the iteration runs (`variance_weight` to `compiled`, and `callback`), is described at
+    :class:`slipcar.planner.options.Options`; where it begins and which horizons it tries (`starts`
+    to `final_time_bounds`, and `check_derivatives`), at :class:`slipcar.planner.options.Guesses`;
+    and what is planned for beyond the mean (`risk` to `terminal_weight`), at
+    :class:`slipcar.planner.search.steering.Request`.
 
     Returns:
         A plan; look at `status` before using it, and at `message` when it is not CONVERGED.
@@ -87,49 +81,30 @@ def plan(
         ValueError: for an option or a problem's function out of range, naming it; for functions
             that can neither be traced nor differentiated, and assumptions that do not hold.
     """
-    began = time.perf_counter()
-    request = Request(risk, risk_price, feedback, expected, terminal_weight, risk_episodes)
-    guesses = Guesses(
-        starts, guess, cold_start, free_first, shooting, free_final_time, time_weight,
-        final_time_bounds, check_derivatives,
-    )  # fmt: skip
-    options = _options(request, guesses, variance_weight, method, dict(
-        solver=solver, tolerance=tolerance, max_iterations=max_iterations, compiled=compiled,
-        trust_region=trust_region, linearization=linearization, callback=callback,
-        terminal_tolerance=terminal_tolerance, integrator=integrator,
-    ))  # fmt: skip
-    with np.errstate(all="ignore"):
-        return _Planning(problem, options, request, guesses, began).run()
-
-
-def _options(
-    request: Request, guesses: Guesses, weight: float | None, method: str, others: dict[str, Any]
-) -> Options:
-    """Options of the iteration, those that depend on what is asked for filled in."""
-    if guesses.shooting and others["compiled"]:
+    asked, began = locals(), time.perf_counter()
+    request, guesses = _of(Request, asked), _of(Guesses, asked)
+    if shooting and compiled:
         raise ValueError("shooting=True watches each iterate: leave compiled=True out")
-    if request.wanted and (guesses.shooting or guesses.free_final_time):
+    if request.wanted and (shooting or free_final_time):
         raise ValueError(
             "risk, risk_price, feedback and expected cannot be combined with shooting or "
             "free_final_time"
         )
-    if weight is None:
-        weight = 0.0 if request.wanted else 1.0
-    if guesses.shooting and method == "auto":
-        method = "convex"
-    return Options(variance_weight=weight, method=method, **others)
+    if variance_weight is None:
+        asked["variance_weight"] = 0.0 if request.wanted else 1.0
+    if shooting and method == "auto":
+        asked["method"] = "convex"
+    with np.errstate(all="ignore"):
+        return _Planning(problem, _of(Options, asked), request, guesses, began).run()
+
+
+def _of(kind: Any, asked: dict[str, Any]) -> Any:
+    """The options that a record holds and describes."""
+    return kind(**{name: asked[name] for name in kind.__dataclass_fields__})
 
 
 class _Planning:
-    """One call of `plan`.
-
-    Args:
-        problem: what is planned for.
-        options: of the iterations.
-        request: what is planned for beyond the mean.
-        guesses: where iterations begin.
-        began: when the call did [s].
-    """
+    """One call of `plan`, which began at a time [s]."""
 
     def __init__(
         self, problem: Problem, options: Options, request: Request, guesses: Guesses, began: float
@@ -137,110 +112,95 @@ class _Planning:
         self.problem, self.options, self.request = problem, options, request
         self.guesses, self.began = guesses, began
         self.extras: dict[str, Any] = {}
-        model = model_of(problem)
-        if options.integrator != model.integrator:
-            model = dataclasses.replace(model, integrator=options.integrator)
-        self.model: Model = model
-        if request.wanted:
-            request.check(options, model)
-        self.bounds = (
-            checked_bounds(model, guesses.final_time_bounds) if guesses.free_final_time else None
-        )
+        self.model = completed(problem, options)
         self.posed: Posed | None = None
-        if uses_newton(model, options):
-            self.posed = pose(model, compiled=options.compiled)
+        self.bounds: tuple[float, float] | None = None
 
     def run(self) -> Plan:
         """Check, plan, and put the plan together."""
-        model, guesses = self.model, self.guesses
-        given = guesses.guess
-        x, u = model.guess() if given is None else given_guess(model, given)
-        if guesses.check_derivatives:  # before the rest, which relies on them
-            checks.check_derivatives(model, x, u)
-        charged = self.options.variance_weight > 0 and not self.request.wanted
-        if self.posed is not None:
-            check_assumptions(self.posed, x, u, charged=charged)
-        else:
-            checks.check(model, x, u, None, charged=charged)
-        candidates = self._candidates(x, u)
+        model, options, guesses, wanted = (
+            self.model,
+            self.options,
+            self.guesses,
+            self.request.wanted,
+        )
+        if wanted:
+            self.request.check(options, model)
         if guesses.free_final_time:
-            candidates = [(candidates[0][0], self._timed(candidates[0][1]))]
-        plan = self._steered(candidates) if self._steers(candidates[0][1]) else self._built(
-            *candidates[0]
-        )  # fmt: skip
-        return self._noted(plan)
+            self.bounds = checked_bounds(model, guesses.final_time_bounds)
+        x, u = given_guess(model, guesses.guess)
+        if guesses.check_derivatives:  # before the rest, which relies on them
+            compare_derivatives(model, x, u)
+        charged = options.variance_weight > 0 and not wanted
+        self.posed = posed_for(model, options, x, u, charged=charged)
+        candidates = self._candidates(x, u)
+        if self.bounds is not None:
+            states, outcome = candidates[0]
+            self.model, outcome, self.extras["time_search"] = search_time(
+                model, self.posed, options, outcome,
+                time_weight=float(guesses.time_weight), bounds=self.bounds,
+            )  # fmt: skip
+            self.problem = reposed(self.problem, times=self.model.times)
+            candidates = [(states, outcome)]
+        ended = candidates[0][1].status in (Status.STOPPED, Status.SOLVER_FAILED)
+        plan = self._built(candidates, steered=wanted and not ended)
+        model = self.model
+        names = sorted(model.jacobians.differenced) if model.knows_jacobians else []
+        if not names:
+            return plan
+        say = f"differentiated numerically, as they cannot be traced: {', '.join(names)}"
+        return plan.replace(message=f"{plan.message}; {say}" if plan.message else say)
 
     def _candidates(self, x: Array, u: Array) -> list[tuple[Array, Outcome]]:
         """Outcomes that differ, each with the states of its guess, the best first."""
-        guesses = self.guesses
-        starts = guesses.starts
+        given, cold_start, starts = self.guesses.guess, self.guesses.cold_start, self.guesses.starts
         if starts is None:
-            starts = _STARTS if self.request.wanted and guesses.guess is None else 1
+            starts = _STARTS if self.request.wanted and given is None else 1
         if starts > 1:
-            tried = multistart(self.model, self.posed, self.options, starts)
-            self.extras["alternatives"] = tried.alternatives
-            best_x, best = tried.different[0]
-            if guesses.shooting:
-                best = self._attempt(best.x, best.u)
-            return [(best_x, best), *tried.different[1:]]
-        if guesses.guess is None:
-            return [(x, self._attempt(x, u, own=True))]
-        if guesses.cold_start == "never":
-            return [(x, self._attempt(x, u))]
-        given = guesses.guess
-        trusted = isinstance(given, Plan) and given.status.ok and guesses.cold_start == "auto"
+            different, rows = multistart(self.model, self.posed, self.options, starts)
+            self.extras["alternatives"] = rows
+            if self.guesses.shooting:
+                states, best = different[0]
+                different[0] = states, self._attempt(best.x, best.u)
+            return different
+        if given is None or cold_start == "never":
+            return [(x, self._attempt(x, u, own=given is None))]
+        trusted = isinstance(given, Plan) and given.status.ok and cold_start == "auto"
         return [run_guarded(self.model, self.options, self._attempt, (x, u), trusted=trusted)]
 
     def _attempt(self, x: Array, u: Array, *, own: bool = False) -> Outcome:
         """What one guess leads to; `own`: it is the problem's."""
         free_first = self.guesses.free_first
         if free_first is None:
-            convex = self.options.method == "convex" or bool(self.options.only_convex)
-            free_first = own and not convex
-        at = (self.model, self.posed, self.options, x, u)
-        if self.guesses.shooting:
-            outcome, self.extras["shot"] = solve_shooting(*at, free_first=free_first)
-            return outcome
-        return attempt(*at, free_first=free_first)
-
-    def _timed(self, outcome: Outcome) -> Outcome:
-        """The plan at the best horizon."""
-        assert self.bounds is not None
-        self.model, outcome, self.extras["time_search"] = search_time(
-            self.model, self.posed, self.options, outcome,
-            time_weight=float(self.guesses.time_weight), bounds=self.bounds,
-        )  # fmt: skip
-        self.problem = reposed(self.problem, times=self.model.times)
+            free_first = own and not self.options.convex
+        task = Task(self.model, self.posed, x, u, free_first)
+        if not self.guesses.shooting:
+            return attempt(task, self.options)
+        outcome, self.extras["shot"] = solve_shooting(task, self.options)
         return outcome
 
-    def _steers(self, outcome: Outcome) -> bool:
-        ended = outcome.status in (Status.STOPPED, Status.SOLVER_FAILED)
-        return self.request.wanted and not ended
-
-    def _steered(self, candidates: list[tuple[Array, Outcome]]) -> Plan:
-        """The plan of the expected cost that plans of the mean lead to."""
-        steering = steer(
-            self.model, self.options, self.request, [outcome for _, outcome in candidates]
-        )
-        x, nominal = candidates[steering.origin]
-        return steered_plan(
-            steering, nominal, self.model, self.problem, guess=x, options=self._record(),
-            seconds=time.perf_counter() - self.began, **self.extras,
+    def _built(self, candidates: list[tuple[Array, Outcome]], *, steered: bool) -> Plan:
+        """The plan of the mean, or of the expected cost that plans of the mean lead to."""
+        origin, changes = 0, {}
+        if steered:
+            outcomes = [outcome for _, outcome in candidates]
+            answer = steer(self.model, self.options, self.request, outcomes)
+            origin = answer.origin
+            changes = steered_fields(answer.plan, self.model) | {
+                "status": answer.status,
+                "iterations": outcomes[origin].iterations + answer.iterations,
+                "message": answer.message,
+                "expected": answer.cost,
+                "risk": answer.risk,
+            }
+            if not self.request.feedback:
+                changes["gains"] = None
+        states, outcome = candidates[origin]
+        plan = plan_of(
+            outcome, self.model, self.problem, options=self._record(), guess=states,
+            solve_time=time.perf_counter() - self.began, **self.extras,
         )  # fmt: skip
-
-    def _built(self, x: Array, outcome: Outcome) -> Plan:
-        return plan_of(
-            outcome, self.model, self.problem, guess=x, options=self._record(),
-            seconds=time.perf_counter() - self.began, **self.extras,
-        )  # fmt: skip
-
-    def _noted(self, plan: Plan) -> Plan:
-        """With a word on derivatives that were taken numerically."""
-        names = sorted(self.model.jacobians.differenced) if self.model.knows_jacobians else []
-        if not names:
-            return plan
-        say = f"differentiated numerically, as they cannot be traced: {', '.join(names)}"
-        return plan.replace(message=f"{plan.message}; {say}" if plan.message else say)
+        return plan.replace(**changes) if changes else plan
 
     def _record(self) -> dict[str, Any]:
         """What the plan was asked for, as plain data."""
@@ -256,8 +216,8 @@ class _Planning:
             "time_weight": float(guesses.time_weight) if guesses.free_final_time else None,
             "final_time_bounds": None if self.bounds is None else list(self.bounds),
             "risk": request.risk,
-            "risk_price": request.price,
-            "risk_episodes": int(request.episodes),
+            "risk_price": request.risk_price,
+            "risk_episodes": int(request.risk_episodes),
             "feedback": bool(request.feedback),
             "expected": bool(request.expected),
             "terminal_weight": None if weight is None else np.asarray(weight, float).tolist(),

@@ -19,12 +19,13 @@ import numpy as np
 
 from slipcar.planner.controllers import OpenLoop
 from slipcar.planner.moments.gains import closed_loop_covariance, wrap
-from slipcar.planner.options import check_count, check_number
+from slipcar.planner.newton.running import solve_noise
+from slipcar.planner.options import check_count, check_flag, check_number
 from slipcar.planner.plan import steered_fields
 from slipcar.planner.planning import plan
 from slipcar.planner.problem.model import model_of
 from slipcar.planner.problem.protocol import Problem
-from slipcar.planner.search.replanning import Tails, handover_of, replanner, stakes_of
+from slipcar.planner.search import replanning
 
 Array = np.ndarray
 
@@ -34,30 +35,13 @@ _FIRST = 100
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Underway:
-    """What a receding-horizon controller remembers of its episodes; never written to.
+    """What a receding-horizon controller remembers of E episodes; not to be written to."""
 
-    Attributes:
-        groups: episodes by the interval their plans begin with.
-        failures: replans that failed so far in each episode, (episodes,).
-    """
-
-    groups: tuple[Group, ...]
-    failures: Array
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Group:
-    """Episodes whose plans begin at the same interval.
-
-    Attributes:
-        interval: which.
-        rows: their places in the batch, (P,).
-        plans: of those episodes.
-    """
-
-    interval: int
-    rows: Array
-    plans: Tails
+    interval: Array  #: at which each episode's plan begins, (E,)
+    plans: (
+        replanning.Plans
+    )  #: over the whole horizon, (E, K, ...); of no meaning before their interval
+    failures: Array  #: replans that failed so far in each episode, (E,)
 
 
 class RecedingHorizon(OpenLoop):
@@ -76,8 +60,7 @@ class RecedingHorizon(OpenLoop):
     spread; this is ill-conditioned near the end, where the last feedback law takes over.
 
     Args:
-        problem: anything that satisfies :class:`slipcar.planner.Problem`, without a
-            `control_radius`.
+        problem: any :class:`slipcar.planner.Problem` without a `control_radius`.
         risk: δ in (0, 1): keep the margins that a plan with feedback needs for it. The price that
             `plan(problem, feedback=True, risk=δ)` finds is charged in every replan; the risk of
             replanning itself is not verified, but as a rule smaller (`plan.risk` is the plan's).
@@ -128,8 +111,7 @@ class RecedingHorizon(OpenLoop):
         check_number("saturation", saturation, zero_allowed=True)
         check_count("iterations", iterations)
         check_count("workers", workers, least=0)
-        if compiled not in (None, True, False):
-            raise ValueError(f"compiled must be None, True or False, not {compiled!r}")
+        check_flag("compiled", compiled, none_allowed=True)
         model = model_of(problem)
         if model.radius < np.inf:
             raise ValueError(
@@ -138,22 +120,24 @@ class RecedingHorizon(OpenLoop):
             )
         if risk is not None and risk_price > 0.0:
             raise ValueError("risk and risk_price exclude each other: risk=δ finds the price")
-        stakes = stakes_of(model, float(risk_price), float(saturation))
-        self._handover = handover_of(model, stakes, handover)
+        stakes = replanning.stakes_of(model, float(risk_price), float(saturation))
+        self._handover = replanning.handover_of(model, stakes, handover)
         price = {"risk": risk} if risk is not None else {"risk_price": float(risk_price) or None}
-        first = plan(problem, feedback=True, compiled=compiled, **price)
-        if first.risk is not None:
-            stakes = stakes_of(model, first.risk.price, float(saturation))
-        self._options = (stakes, int(iterations), float(tolerance), int(workers), compiled)
-        self._replanner = replanner(model, *self._options)
-        steered = self._replanner.first(first.mean, first.controls, _FIRST)
-        self._first = Tails.of(steered)
+        nominal = plan(problem, feedback=True, compiled=compiled, **price)
+        if nominal.risk is not None:
+            stakes = stakes.at_price(nominal.risk.price)
+        self._replanner = replanning.Replanner(
+            problem, stakes, int(iterations), float(tolerance), int(workers), compiled
+        )
+        steered = solve_noise(
+            self._replanner.posed, stakes, nominal.mean, nominal.controls,
+            tolerance=float(tolerance), max_iterations=_FIRST,
+        )  # fmt: skip
+        self._first: replanning.Plans = {name: getattr(steered, name) for name in FIELDS}
         super().__init__(
-            first.replace(
+            nominal.replace(
                 **steered_fields(steered, model),
-                status=steered.status,
-                iterations=first.iterations + steered.iterations,
-                gains=steered.gains,
+                iterations=nominal.iterations + steered.iterations,
                 solve_time=time.perf_counter() - began,
                 message="",
             )
@@ -189,144 +173,101 @@ class RecedingHorizon(OpenLoop):
             float32 actions, (m,) or (batch, m), and the state.
 
         Raises:
-            ValueError: if an observation has the wrong length or is not finite, or if the state
-                is of another number of episodes.
+            ValueError: for an observation of wrong length or not finite, or another state.
         """
         t, x = self._decode(observation)
         shape, n = np.shape(x)[:-1], np.shape(x)[-1]
         x = np.array(x, dtype=np.float64).reshape(-1, n)
-        E = len(x)
         interval = np.broadcast_to(self._interval(t), shape).reshape(-1)
-        source = self._sources(state, episode_start, interval)
-        failures = np.zeros(E, dtype=np.int64)
-        if state is not None:
-            failures[:] = np.where(source >= 0, state.failures, 0)
-        u, groups = np.empty((E, self.plan.controls.shape[1])), []
+        now = self._recalled(state, episode_start, interval)
+        u = np.empty((len(x), self.plan.controls.shape[1]))
         for k in np.unique(interval):
             rows = np.flatnonzero(interval == k)
-            before = self._plans_at(int(k), state, source, rows)
-            here = _unwrapped(x[rows], before.x[:, 0], self._angles)
-            after, replanned, ok = self._replanned(int(k), before, here)
-            failures[rows] += replanned & ~ok
-            played = np.where(ok[:, None], after.u[:, 0], before.law(here))
-            u[rows] = self._replanner.model.admissible(played)
-            groups.append(Group(int(k), rows, after))
-        encode = getattr(self.plan.problem, "encode_control", None)
-        u = u.reshape(*shape, u.shape[1])
-        action = np.asarray(u if encode is None else encode(u), dtype=np.float32)
-        return action, Underway(tuple(groups), failures)
+            u[rows] = self._played(now, rows, int(k), x[rows])
+        u = self._replanner.posed.model.admissible(u)
+        return self._action(u.reshape(*shape, u.shape[1])), now
 
     def preview(self, state: Underway | None = None, row: int = 0) -> tuple[Array, Array | None]:
-        """An episode's latest plan, from the state it was made from.
-
-        Args:
-            state: what `predict` returned; None is before the start.
-            row: which episode of those `predict` was asked for.
-
-        Returns:
-            Mean states (K + 1, n) and closed-loop covariances (K + 1, n, n).
+        """An episode's latest plan, from the state it was made from; see `OpenLoop.preview`.
 
         Raises:
             ValueError: if the state is of fewer episodes.
         """
         if state is None:
             return self.plan.mean, self.plan.covariance
-        for group in state.groups:
-            for place in np.flatnonzero(group.rows == row):
-                x, A, B, gains = (getattr(group.plans, f)[place] for f in ("x", "A", "B", "gains"))
-                model, times = self._replanner.model, self.plan.times[group.interval :]
-                known = np.zeros((x.shape[1], x.shape[1]))
-                return x, closed_loop_covariance(model, times, x, A, B, gains, start=known)
-        raise ValueError(f"row must be one of the state's {len(state.failures)}, not {row}")
+        if not 0 <= row < len(state.failures):
+            raise ValueError(f"row must be one of the state's {len(state.failures)}, not {row}")
+        k = state.interval[row]
+        x, A, B, gains = (state.plans[name][row, k:] for name in ("x", "A", "B", "gains"))
+        model, known = self._replanner.posed.model, np.zeros((x.shape[1], x.shape[1]))
+        return x, closed_loop_covariance(model, model.times[k:], x, A, B, gains, start=known)
 
-    def _sources(self, state: Any, episode_start: Any, interval: Array) -> Array:
-        """Which group of the state each episode goes on from, (E,); −1 where it begins anew."""
+    def _recalled(self, state: Any, episode_start: Any, interval: Array) -> Underway:
+        """What is known of episodes at these intervals (E,), to be written to."""
         E = len(interval)
-        source = np.full(E, -1)
         if state is None:
-            return source
-        if not isinstance(state, Underway) or len(state.failures) != E:
-            what = (
-                f"of {len(state.failures)} episodes"
-                if isinstance(state, Underway)
-                else f"a {type(state).__name__}"
-            )
+            plans = {name: np.repeat(a[None], E, axis=0) for name, a in self._first.items()}
+            return Underway(interval, plans, np.zeros(E, dtype=np.int64))
+        known = isinstance(state, Underway)
+        if not known or len(state.failures) != E:
+            what = f"of {len(state.failures)} episodes" if known else f"a {type(state).__name__}"
             raise ValueError(
                 f"state must be what predict returned for the same {E} episodes, not {what}"
             )
-        for i, group in enumerate(state.groups):
-            source[group.rows] = np.where(interval[group.rows] >= group.interval, i, -1)
+        anew = interval < state.interval
         if episode_start is not None:
             starts = np.asarray(episode_start, dtype=bool).reshape(-1)
             if len(starts) not in (1, E):
                 raise ValueError(f"episode_start must be one flag or {E}, not {len(starts)}")
-            source[np.broadcast_to(starts, (E,))] = -1
-        return source
+            anew = anew | starts
+        plans = {name: np.array(array) for name, array in state.plans.items()}
+        if anew.any():
+            for name, array in plans.items():
+                array[anew] = self._first[name]
+        return Underway(interval, plans, np.where(anew, 0, state.failures))
 
-    def _plans_at(self, k: int, state: Underway | None, source: Array, rows: Array) -> Tails:
-        """The plans up to now of some episodes, from interval k on."""
-        parts = []
-        for i in np.unique(source[rows]):
-            places = np.flatnonzero(source[rows] == i)
-            if i < 0 or state is None:
-                parts.append((places, self._first.later(k).repeat(len(places))))
-                continue
-            group = state.groups[i]
-            tails = group.plans.later(k - group.interval)
-            if len(places) < len(group.rows) or not np.array_equal(rows[places], group.rows):
-                order = np.argsort(group.rows)
-                at = np.searchsorted(group.rows, rows[places], sorter=order)
-                tails = tails.take(order[at])
-            parts.append((places, tails))
-        return Tails.join(parts, len(rows))
-
-    def _replanned(self, k: int, before: Tails, x: Array) -> tuple[Tails, Array, Array]:
-        """Plans from states x (P, n), which are new or were tried to be, which succeeded (P,)."""
+    def _played(self, now: Underway, rows: Array, k: int, x: Array) -> Array:
+        """Controls (P, m) of episodes at interval k in states x (P, n), replanned if possible."""
+        plans = now.plans
+        # Observations know angles modulo 2π: on the plan's branch.
+        mean = plans["x"][rows, k]
+        x = mean + wrap(x - mean, self._angles)
+        u = plans["u"][rows, k] + replanning.applied(plans["gains"][rows, k], x - mean)
         wanted = np.full(len(x), len(self.plan.controls) - k >= self._handover)
         if k == 0:  # where it was planned for, there is nothing to add
             wanted &= (np.float32(x) != np.float32(self.plan.mean[0])).any(axis=1)
-        ok = np.zeros(len(x), dtype=bool)
         if not wanted.any():
-            return before, wanted, ok
-        began = time.perf_counter()
-        rows = np.flatnonzero(wanted)
-        whole = len(rows) == len(x)
-        tails = before if whole else before.take(rows)
-        after, ok[rows] = self._replanner.replan(tails, x[rows], k)
-        if not whole:
-            others = np.flatnonzero(~wanted)
-            after = Tails.join([(rows, after), (others, before.take(others))], len(x))
-        after = after.choose(ok, before)
-        self.replans += len(rows)
-        self.failures += int((wanted & ~ok).sum())
+            return u
+        began, again = time.perf_counter(), rows[wanted]
+        tails = {name: array[again, _from(name, k)] for name, array in plans.items()}
+        ok = self._replanner.replan(tails, x[wanted], k)
+        kept = again[ok]
+        for name, array in tails.items():
+            plans[name][kept, _from(name, k)] = array if len(kept) == len(ok) else array[ok]
+        u[np.flatnonzero(wanted)[ok]] = tails["u"][ok, 0]
+        now.failures[again] += ~ok
+        self.replans += len(again)
+        self.failures += int((~ok).sum())
         self.seconds += time.perf_counter() - began
-        return after, wanted, ok
+        return u
 
     def _numbers(self) -> list[Array]:
-        stakes, iterations, tolerance, _, _ = self._options
-        model = self._replanner.model
+        replanner, model = self._replanner, self._replanner.posed.model
+        stakes, options = replanner.stakes, (replanner.iterations, replanner.tolerance)
         return [
             *super()._numbers(),
-            *(getattr(self._first, f.name) for f in dataclasses.fields(Tails)),
+            *self._first.values(),
             stakes.weight,
             stakes.terminal,
-            np.array([stakes.saturation, iterations, tolerance, self._handover]),
-            np.array([self._replanner.posed.native]),
+            np.array([stakes.saturation, *options, self._handover]),
+            np.array([replanner.posed.native]),
             model.R,
             model.lower,
             model.upper,
-            self._replanner.posed.numbers,
+            replanner.posed.numbers,
         ]
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Compiled functions do not travel to other processes; they are found again there.
-        return {name: value for name, value in vars(self).items() if name != "_replanner"}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._replanner = replanner(model_of(self.plan.problem), *self._options)
-
-
-def _unwrapped(x: Array, mean: Array, angles: tuple[int, ...]) -> Array:
-    """States (P, n) with angles on the plan's branch: observations know them modulo 2π."""
-    return mean + wrap(x - mean, angles)
+def _from(name: str, interval: int) -> slice:
+    """What is left of a plan's array at an interval; multipliers of the end have no time."""
+    return slice(None) if name == "terminal" else slice(interval, None)

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 NAMES = {"envs", "planner", "baselines", "evaluation"}
 # What no plan needs, or not until it is asked for.
-HEAVY = ["torch", "gymnasium", "matplotlib", "pandas", "osqp", "cvxpy", "numba"]
+HEAVY = ["torch", "gymnasium", "matplotlib", "pandas", "osqp", "cvxpy"]
 
 
 def sources():
@@ -105,7 +105,7 @@ print("drove")
 EXTRAS = sorted(
     {
         *["torch", "stable_baselines3", "tensorboard", "tqdm", "matplotlib", "PIL", "pygame"],
-        *["osqp", "cvxpy", "clarabel", "numba", "casadi"],
+        *["osqp", "cvxpy", "clarabel", "casadi"],
     }
 )
 
@@ -117,6 +117,25 @@ def test_planning_and_driving_need_no_extra():
 def test_the_shipped_policy_needs_no_extra():
     policy = ', __import__("slipcar.baselines").baselines.load_policy()'
     assert run(WITHOUT_EXTRAS.format(missing=EXTRAS, policy=policy)) == "drove\n"
+
+
+def test_the_planner_needs_nothing_but_numpy_and_scipy_to_plan_slowly():
+    """Without llvmlite it says so, once, and takes the same steps."""
+    missing = sorted({*HEAVY, *EXTRAS, "llvmlite"})
+    code = (
+        f"import sys\nfor name in {missing}:\n    sys.modules[name] = None\n"
+        "import numpy as np\n"
+        "class Cart:\n"
+        "    start, times, control_weight = np.zeros(2), np.linspace(0.0, 1.0, 11), np.eye(1)\n"
+        "    drift = lambda self, t, x, u: np.stack([x[..., 1], u[..., 0]], axis=-1)\n"
+        "    diffusion = lambda self, t, x: 0.1 * np.ones((*x.shape, 1))\n"
+        "    terminal = lambda self, x: x - np.array([1.0, 0.0])\n"
+        "from slipcar.planner import plan\n"
+        "print(*(plan(Cart()).status.name for _ in range(2)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/")
+    assert done.stdout == "CONVERGED CONVERGED\n", done.stderr
+    assert done.stderr.count("llvmlite is missing") == 1
 
 
 # --- what it needs ------------------------------------------------------------------------

@@ -58,8 +58,8 @@ def plan(
         slipcar plan --solver cvxpy --linearization literal --trust-region paper
         slipcar plan --compare-methods residuals.png
 
-    Calls slipcar.planner.plan, twice (but with --risk): the second is timed, when compiled code is
-    in memory.
+    Calls slipcar.planner.plan, twice (but with --risk): the second is timed, when machine code is
+    in memory. It is kept on disk, too: in ~/.cache/slipcar, or in SLIPCAR_CACHE_DIR.
 
     Args:
         scenario: which world.
@@ -72,8 +72,9 @@ def plan(
         method: newton: one LQ problem per iteration, quadratic at the end; convex: the paper's
             scheme, exact convex sub-problems; auto: newton, and convex where it is asked for
             by another option or newton does not converge.
-        compiled: Newton's method compiled by numba; auto: where that is possible. yes says what
-            is in the way, if anything.
+        compiled: Newton's method as machine code, made from the scenario's functions; auto: where
+            that is possible; yes says what is in the way, if anything; no takes the same steps in
+            NumPy, a few hundred times slower.
         integrator: of the mean; euler is the paper's.
         tolerance: stop when the squared change of the controls over two iterations, integrated
             over time, falls below this.

@@ -29,30 +29,19 @@ _DEPTH, _FAST, _PATIENCE, _LONGER, _LONGEST = 6, 0.1, 2, 1.5, 10.0
 
 
 class Acceleration:
-    """Remembers the last few steps and proposes where to go instead of the next one.
-
-    Args:
-        dt: interval lengths, (K,) [s].
-    """
+    """Remembers the last few steps, dt (K,) [s], and proposes where to go instead of the next."""
 
     def __init__(self, dt: Array) -> None:
         self._weight = np.sqrt(dt)[:, None]
-        self._steps: list[tuple[Array, Array, Array]] = []  # residual, states, controls
-        self._last, self._slow = 0.0, 0
+        self.forget()
 
     def forget(self) -> None:
         """Start anew: the iteration is not what it was (another trust region, other bounds)."""
-        self._steps.clear()
+        self._steps: list[tuple[Array, Array, Array]] = []  # residual, states, controls
         self._last, self._slow = 0.0, 0
 
     def observe(self, u: Array, new_x: Array, e: Array) -> bool:
-        """Take note of a step, and say whether steps have become slow.
-
-        Args:
-            u: iterate, (K, m).
-            new_x: states the step leads to, (N, n).
-            e: change of the controls, (K, m).
-        """
+        """Note a step e (K, m) from u (K, m) to states new_x (N, n): have steps become slow?"""
         residual = (self._weight * e).ravel()
         size = float(residual @ residual)
         self._slow = self._slow + 1 if size > _FAST * self._last > 0.0 else 0
@@ -64,10 +53,7 @@ class Acceleration:
     def propose(self, x: Array, u: Array, ratio: float) -> list[tuple[Array, Array]]:
         """States (N, n) and controls (K, m) to try in turn instead of the step observed last.
 
-        Args:
-            x: iterate, (N, n).
-            u: iterate, (K, m).
-            ratio: decrease of the merit function by the step over that by the model.
+        It was made from x, u; `ratio` is the decrease of the merit function over the model's.
         """
         residual, new_x, new_u = self._steps[-1]
         if ratio > _LONGER:

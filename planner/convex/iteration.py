@@ -23,11 +23,10 @@ import time
 import numpy as np
 
 from slipcar.planner.convex.acceleration import Acceleration
-from slipcar.planner.convex.merit import Iterate, Merit, iterate_at, model_merit, variance_of
+from slipcar.planner.convex.merit import Iterate, Merit, iterate_at
 from slipcar.planner.convex.solvers.interface import Solution, Solver
-from slipcar.planner.convex.subproblem import Subproblem, convexify
+from slipcar.planner.convex.subproblem import Subproblem, convexify, variance_of
 from slipcar.planner.convex.trust_region import Step, TrustRegion
-from slipcar.planner.history import Iteration
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
@@ -40,6 +39,7 @@ from slipcar.planner.problem.feasibility import (
 )
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model
+from slipcar.planner.records import Iteration
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -86,24 +86,30 @@ def iterate(
 
 @dataclasses.dataclass(frozen=True)
 class _Proposal:
-    """A sub-problem and its solution."""
+    """A sub-problem and its solution; Δ and −p¹ of its trust region, ∫ ‖u_{k+1} − u_k‖² dt.
+
+    The radius is ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts.
+    """
 
     sub: Subproblem
     solution: Solution
-    radius: float  # ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts
-    multiplier: float  # of the trust region, −p¹
-    step: float  # ∫ ‖u_{k+1} − u_k‖² dt
+    radius: float
+    multiplier: float
+    step: float
 
 
 @dataclasses.dataclass(frozen=True)
 class _Candidate:
-    """What the non-linear problem makes of a proposal."""
+    """Where a proposal leads: Φ there and before, its decrease by the model and in fact.
+
+    The decrease is −∞ where something is not finite.
+    """
 
     at: Iterate
     merit: float
-    before: float  # Φ at the iterate
-    predicted: float  # decrease of Φ by the model
-    actual: float  # decrease of Φ, −∞ where something is not finite
+    before: float
+    predicted: float
+    actual: float
 
 
 class _Attempt:
@@ -113,6 +119,7 @@ class _Attempt:
         self, model: Model, solver: Solver, trust: TrustRegion, options: Options, x: Array, u: Array
     ) -> None:
         self.model, self.solver, self.trust, self.options = model, solver, trust, options
+        self.composite = options.linearization == "composite"
         clock = time.perf_counter()
         self.at = iterate_at(model, options.variance_weight, x, u)
         self.linearize_seconds = time.perf_counter() - clock
@@ -126,8 +133,10 @@ class _Attempt:
         self.acceleration = Acceleration(model.dt)
         self.history: list[Iteration] = []
         # While steps are long the controls have no limits: see the module's docstring.
-        limited = model.bounded or model.radius < np.inf
-        self.relaxed = _without_limits(model) if trust.bold and limited else None
+        self.relaxed: Model | None = None
+        if trust.bold and (model.bounded or model.radius < np.inf):
+            inf = np.full(model.control_dim, np.inf)
+            self.relaxed = dataclasses.replace(model, lower=-inf, upper=inf, radius=np.inf)
 
     def run(self) -> Outcome:
         """Iterate to the end."""
@@ -139,15 +148,13 @@ class _Attempt:
             if not proposal.solution.found:
                 # A shorter step is an easier sub-problem; a schedule that knows none gives up.
                 self.relaxed = None
-                trust.judge(Step(np.nan, 0.0, -np.inf, np.inf, np.inf))
+                trust.judge(Step(np.nan, 0.0, -np.inf, np.inf))
                 if trust.collapsed:
                     return self.outcome(Status.SOLVER_FAILED, proposal.solution.message)
                 continue
             new = self.evaluate(proposal)
             promised = max(new.predicted, 0.0)
-            accepted = trust.judge(
-                Step(proposal.radius, promised, new.actual, new.merit, new.before)
-            )
+            accepted = trust.judge(Step(proposal.radius, promised, new.actual, new.before))
             if not accepted or trust.multiplier > 0.0:
                 self.acceleration.forget()
             seconds = self.linearize_seconds + time.perf_counter() - solved, solved - clock
@@ -157,11 +164,11 @@ class _Attempt:
             stop = options.callback is not None and options.callback(self.history[-1])
             if accepted:
                 status = self.accept(proposal, new, np.inf if unlimited else proposal.step)
-                if status is Status.CONVERGED:
-                    return self.outcome(status)
                 if status is Status.INFEASIBLE:
                     lacks = what_lacks(self.at.lin, options.terminal_tolerance, self.size)
                     return self.outcome(status, lacks)
+                if status is not None:
+                    return self.outcome(status)
             elif trust.collapsed:
                 return self.outcome(Status.STALLED)
             if stop:
@@ -180,7 +187,7 @@ class _Attempt:
                 model,
                 self.at.lin,
                 variance=self.at.variance,
-                composite=options.linearization == "composite",
+                composite=self.composite,
                 trust_multiplier=multiplier,
                 trust_weight=weight,
                 rho=self.rho,
@@ -215,16 +222,16 @@ class _Attempt:
         x[1:] += solution.d
         merit = Merit(solution, options.terminal_tolerance, self.rho)
         before = merit(self.at)
-        trust_cost = proposal.multiplier * proposal.radius
-        composite = options.linearization == "composite"
-        predicted = before - model_merit(self.at, solution, trust_cost, composite=composite)
+        # Φ by the model, which leaves no defects; the literal one holds only changes of penalties.
+        constant = self.at.smooth_cost + (0.0 if self.composite else lin.penalty)
+        promised = constant + solution.objective - proposal.multiplier * proposal.radius
+        predicted = before - promised
         new = iterate_at(model, options.variance_weight, x, lin.u + solution.e)
-        after = merit(new)
         far = proposal.step + self.last_step > options.tolerance
         free = trust.accelerates and self.relaxed is None and proposal.multiplier == 0.0
         if far and free and self.acceleration.observe(lin.u, x, solution.e):
             new = self.accelerated(new, merit, before, predicted)
-            after = merit(new)
+        after = merit(new)
         actual = before - after if np.isfinite(after) and new.lin.finite else -np.inf
         return _Candidate(new, after, before, predicted, actual)
 
@@ -241,7 +248,7 @@ class _Attempt:
         return new
 
     def limit_controls(self, proposal: _Proposal, new: _Candidate, accepted: bool) -> bool:
-        """Let control bounds act once steps are short; whether this one, which passed them, counts.
+        """Let control bounds act once steps are short.
 
         Returns:
             True for a step that the bounds take back: it says nothing of convergence.
@@ -322,7 +329,7 @@ class _Attempt:
         """What has been reached, with controls that are admissible however it ended."""
         model, weight, lin = self.model, self.options.variance_weight, self.at.lin
         if not status.ok and not np.array_equal(inside := model.admissible(lin.u), lin.u):
-            lin = iterate_at(model, weight, lin.x, inside).lin
+            lin = linearize(model, lin.x, inside)
         return Outcome.at(
             lin,
             model,
@@ -334,8 +341,3 @@ class _Attempt:
             trust_multiplier=self.trust_multiplier,
             message=message,
         )
-
-
-def _without_limits(model: Model) -> Model:
-    inf = np.full(model.control_dim, np.inf)
-    return dataclasses.replace(model, lower=-inf, upper=inf, radius=np.inf)

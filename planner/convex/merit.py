@@ -17,7 +17,8 @@ import dataclasses
 import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solution
-from slipcar.planner.moments import covariance as moments
+from slipcar.planner.convex.subproblem import variance_of
+from slipcar.planner.moments.covariance import Variance
 from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model
 
@@ -29,15 +30,10 @@ _quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @dataclasses.dataclass(frozen=True)
 class Iterate:
-    """A linearisation with the variance terms that belong to it.
-
-    Attributes:
-        lin: the linearisation.
-        variance: w ∫ tr Σ dt as a quadratic, or None for w = 0.
-    """
+    """A linearisation, and w ∫ tr Σ dt there as a quadratic (None for w = 0)."""
 
     lin: Linearization
-    variance: moments.Variance | None
+    variance: Variance | None
 
     @property
     def smooth_cost(self) -> float:
@@ -53,24 +49,8 @@ def iterate_at(model: Model, variance_weight: float, x: Array, u: Array) -> Iter
     return Iterate(lin, variance_of(model, lin, variance_weight))
 
 
-def variance_of(model: Model, lin: Linearization, weight: float) -> moments.Variance | None:
-    """Return w ∫ tr Σ dt as a quadratic, or None for w = 0."""
-    if weight == 0.0:
-        return None
-    d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], lin.x[:-1]))
-    Lambda = moments.adjoint_weights(lin.A, model.dt)
-    start = moments.start_share(lin.A, Lambda, model.start_covariance)
-    return moments.variance_penalty(weight, lin.sigma, d_sigma, Lambda, model.dt, start)
-
-
 class Merit:
-    """Φ with the multipliers of one solution.
-
-    Args:
-        solution: of the sub-problem.
-        tolerance: τ of its terminal box.
-        rho: ρ of its terminal penalty.
-    """
+    """Φ with the multipliers of a solution; τ of its terminal box and ρ of its penalty."""
 
     def __init__(self, solution: Solution, tolerance: float, rho: float) -> None:
         self.adjoint, self.terminal, self.tolerance = solution.adjoint, solution.terminal, tolerance
@@ -103,16 +83,3 @@ class Merit:
 
     def _beyond(self, g: Array) -> Array:
         return g - np.minimum(np.maximum(g, -self.tolerance), self.tolerance)
-
-
-def model_merit(at: Iterate, solution: Solution, trust_cost: float, *, composite: bool) -> float:
-    """Φ of the step by the convex model, which leaves no defects.
-
-    Args:
-        at: the iterate.
-        solution: of the sub-problem there.
-        trust_cost: what the trust region adds to its objective.
-        composite: whether the sub-problem holds the penalties themselves, or their changes.
-    """
-    constant = at.smooth_cost + (0.0 if composite else at.lin.penalty)
-    return constant + solution.objective - trust_cost

@@ -12,9 +12,8 @@ With deviations d_k = μ_k − μ̄_k and e_k = u_k − ū_k, K = N − 1 interv
 * The hinge rows are the convex-composite model of L = w max(0, c)²: c is linearised, the
   square of the positive part is kept. The literal scheme linearises L whole: no rows, only q.
 * The smooth running costs H(t, x) and ℓ(t, x)ᵀu enter q, r and, with the Hessian of H made
-  positive semidefinite, Q.
-* The variance penalty w ∫ tr Σ enters Q and q (:mod:`slipcar.planner.moments.covariance`).
-* The trust region enters Q with its multiplier (:mod:`.trust_region`).
+  positive semidefinite, Q; the variance penalty w ∫ tr Σ enters Q and q
+  (:mod:`slipcar.planner.moments.covariance`), the trust region Q (:mod:`.trust_region`).
 * The terminal condition is an exact penalty: satisfied exactly whenever its multiplier stays
   below ρ, and every sub-problem is feasible. The remainder is the virtual control.
 """
@@ -25,7 +24,7 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.moments.covariance import Variance
+from slipcar.planner.moments import covariance as moments
 from slipcar.planner.problem.control_set import project_controls
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
@@ -33,29 +32,55 @@ from slipcar.planner.problem.model import Model
 Array = np.ndarray
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Held:
+    """Which controls are held on the boundary of U: at bounds (K, m), on spheres (K,).
+
+    Spheres are touched in directions `turn` (K, m) with multipliers `press` (K,); zero where off.
+    """
+
+    lower: Array
+    upper: Array
+    on: Array
+    turn: Array
+    press: Array
+
+    @classmethod
+    def nothing(cls, K: int, m: int) -> Held:
+        """No control is held."""
+        off, zeros = np.zeros((K, m), dtype=bool), np.zeros((K, m))
+        return cls(off, off, off[:, 0], zeros, zeros[:, 0])
+
+    @property
+    def any(self) -> bool:
+        """Whether any control is held."""
+        return bool(self.lower.any() or self.upper.any() or self.on.any())
+
+    def same_as(self, other: Held) -> bool:
+        """Whether the same controls are held, and along the same tangents."""
+        if self is other:
+            return True
+        masks = ((a.lower, a.upper, a.on) for a in (self, other))
+        if any((a != b).any() for a, b in zip(*masks, strict=True)):
+            return False
+        turned = np.max(np.abs(self.turn - other.turn), initial=0.0)
+        pressed = np.max(np.abs(self.press - other.press), initial=0.0)
+        return bool(turned <= 1e-9 and pressed <= 1e-6 * (1.0 + np.max(self.press, initial=0.0)))
+
+
 @dataclasses.dataclass(frozen=True)
 class Subproblem:
     """The convex sub-problem as arrays; the module's docstring names them.
 
     Attributes:
-        A: (K, n, n).
-        B: (K, n, m).
-        f: (K, n).
-        Q: node k+1 in row k, (K, n, n), positive semidefinite.
-        q: (K, n).
-        R: (K, m, m), positive definite.
-        r: (K, m).
-        a: hinge rows, (K, p, n).
-        b: (K, p).
-        h: hinge weights, (K, p), ≥ 0.
-        G: (q, n).
-        g: (q,).
-        rho: ρ > 0.
-        tolerance: τ ≥ 0; 0 asks for equality.
-        lower: (K, m), −inf where unbounded.
-        upper: (K, m).
-        center: centres −ū_k of the balls of controls, (K, m).
-        radius: theirs, inf where there are none.
+        A, B, f: dynamics, (K, n, n), (K, n, m), (K, n).
+        Q, q: costs of node k + 1 in row k, (K, n, n) positive semidefinite, (K, n).
+        R, r: costs of controls, (K, m, m) positive definite, (K, m).
+        a, b, h: hinge rows, (K, p, n), (K, p), and their weights ≥ 0, (K, p).
+        G, g: terminal condition, (q, n), (q,).
+        rho, tolerance: ρ > 0; τ ≥ 0, of which 0 asks for equality.
+        lower, upper: bounds, (K, m), infinite where there are none.
+        center, radius: of the balls of controls, −ū_k, (K, m); inf where there are none.
     """
 
     A: Array
@@ -83,14 +108,16 @@ class Subproblem:
 
     def objective(self, d: Array, e: Array) -> float:
         """Value at deviations d (K, n) of nodes 1..K and e (K, m)."""
-        return self.cost(d, e) + self.rho * self.virtual_control(d)
-
-    def cost(self, d: Array, e: Array) -> float:
-        """The same without the terminal penalty."""
         hinge = np.maximum(self.hinge_arguments(d), 0.0)
         value = np.vdot(e, 0.5 * np.matmul(self.R, e[..., None])[..., 0] + self.r)
         value += np.vdot(d, 0.5 * np.matmul(self.Q, d[..., None])[..., 0] + self.q)
-        return float(value + 0.5 * np.vdot(self.h, hinge * hinge))
+        value += 0.5 * np.vdot(self.h, hinge * hinge)
+        return float(value) + self.rho * self.virtual_control(d)
+
+    def slope(self, e: Array, adjoint: Array) -> Array:
+        """Gradient with respect to the controls at e, R e + r + Bᵀλ, (K, m)."""
+        bent = np.matmul(self.R, e[..., None])[..., 0]
+        return bent + self.r + np.matmul(adjoint[:, None], self.B)[:, 0]
 
     def response(self, e: Array) -> Array:
         """Deviations of nodes 1..K under control deviations e (K, m): (K, n)."""
@@ -109,19 +136,103 @@ class Subproblem:
         """Whether any control bound is finite."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
+    @property
+    def limited(self) -> bool:
+        """Whether controls have any limits."""
+        return self.radius < np.inf or self.bounded
+
+    def strictly_inside(self, e: Array) -> bool:
+        """Whether no control is at its limits."""
+        inside = bool(((self.lower < e) & (e < self.upper)).all())
+        if inside and self.radius < np.inf:
+            inside = bool((np.linalg.norm(e - self.center, axis=1) < self.radius).all())
+        return inside
+
     def admissible(self, e: Array) -> Array:
         """The nearest deviations within bounds and balls, (K, m)."""
         if self.radius == np.inf:
             return np.clip(e, self.lower, self.upper) if self.bounded else e
+        return self._nearest(e - self.center) + self.center
+
+    def _nearest(self, u: Array) -> Array:
+        """The same for controls u themselves."""
+        if not self.bounded:
+            size = np.linalg.norm(u, axis=1, keepdims=True)
+            return u * (self.radius / np.maximum(size, self.radius))
+        return project_controls(u, self.lower - self.center, self.upper - self.center, self.radius)
+
+    def wanted(self, e: Array, slope: Array) -> Array:
+        """Where −D⁻¹ slope leads from e, (K, m): D is R's diagonal, or one number where balls are.
+
+        Its projection is e exactly where e is optimal.
+        """
+        D = np.einsum("kii->ki", self.R)
+        return e - slope / (D.max(axis=1, keepdims=True) if self.radius < np.inf else D)
+
+    def held(self, e: Array, slope: Array) -> Held:
+        """Which part of the boundary the projection of :meth:`wanted` lies on."""
+        K, m = e.shape
+        u, wanted = e - self.center, self.wanted(e, slope) - self.center
         low, high = self.lower - self.center, self.upper - self.center
-        return project_controls(e - self.center, low, high, self.radius) + self.center
+        nearest = self._nearest(wanted) if self.radius < np.inf else np.clip(wanted, low, high)
+        # What is at one side and wants to the other is released.
+        lower, upper = (nearest <= low) & (u < high), (nearest >= high) & (u > low)
+        if self.radius == np.inf:
+            return dataclasses.replace(Held.nothing(K, m), lower=lower, upper=upper)
+        # On a sphere what is free of the box is shrunk by 1 + μ/(r D) to come there.
+        free = ~(lower | upper)
+        shrunk, size, whole = (
+            np.linalg.norm(np.where(mask, v, 0.0), axis=1)
+            for mask, v in ((free, nearest), (free, wanted), (True, u))
+        )
+        outwards = np.einsum("ki,ki->k", u, wanted) > 0.0
+        on = (size > shrunk) & (shrunk > 1e-6 * self.radius) & outwards
+        D = np.einsum("kii->ki", self.R).max(axis=1)
+        press = self.radius * D * (size / np.where(on, shrunk, 1.0) - 1.0)
+        turn = u / np.where(on, whole, 1.0)[:, None]
+        return Held(lower, upper, on, np.where(on[:, None], turn, 0.0), np.where(on, press, 0.0))
+
+    def free_controls(self, held: Held, H: Array, r: Array) -> tuple[Array, Array]:
+        """M and e⁰ of :mod:`slipcar.planner.lq.banded`, for the cost ½ eᵀHe + rᵀe of controls.
+
+        A sphere holds tᵀu = radius and adds the curvature ½ (μ/radius) uᵀ(I − t tᵀ)u.
+        """
+        eye = np.eye(H.shape[1])
+        box = ~(held.lower | held.upper)
+        P = box[..., None] * eye  # onto what is free
+        fixed = np.where(held.lower, self.lower, np.where(held.upper, self.upper, 0.0))
+        if held.on.any():
+            t, normal = held.turn, np.where(box, held.turn, 0.0)
+            length = np.where(held.on, np.einsum("ki,ki->k", normal, normal), 1.0)[:, None]
+            short = held.on * self.radius + np.einsum("ki,ki->k", t, self.center - fixed)
+            fixed = fixed + normal / length * short[:, None]
+            P = P - normal[:, :, None] * (normal / length)[:, None, :]
+            across = eye - t[:, :, None] * t[:, None, :]
+            curvature = (held.press / self.radius)[:, None, None] * across
+            H, r = H + curvature, r - np.matmul(curvature, self.center[..., None])[..., 0]
+        M = np.linalg.inv(P @ H @ P + (eye - P)) - (eye - P)
+        pull = r + np.matmul(H, fixed[..., None])[..., 0]
+        return M, fixed - np.matmul(M, pull[..., None])[..., 0]
+
+
+def variance_of(
+    model: Model, at: Linearization, weight: float, Lambda: Array | None = None
+) -> moments.Variance | None:
+    """Return w ∫ tr Σ dt as a quadratic, its Λ (K, n, n) held if given; None for w = 0."""
+    if weight == 0.0:
+        return None
+    d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], at.x[:-1]))
+    if Lambda is None:
+        Lambda = moments.adjoint_weights(at.A, model.dt)
+    start = moments.start_share(at.A, Lambda, model.start_covariance)
+    return moments.variance_penalty(weight, at.sigma, d_sigma, Lambda, model.dt, start)
 
 
 def convexify(
     model: Model,
     at: Linearization,
     *,
-    variance: Variance | None,
+    variance: moments.Variance | None,
     composite: bool = True,
     trust_multiplier: float = 0.0,
     trust_weight: Array | None = None,
@@ -133,7 +244,7 @@ def convexify(
     Args:
         model: the problem.
         at: its linearisation.
-        variance: w ∫ tr Σ there as a quadratic, or None for w = 0.
+        variance: of :func:`variance_of`.
         composite: keep φ = max(0, ·)² and linearise its argument; otherwise linearise L.
         trust_multiplier: weight of ∫ E‖x − x_k‖² (−p¹ of the paper), ≥ 0.
         trust_weight: Hessian blocks of that integral, (K, n, n); needed if the weight is > 0.

@@ -8,6 +8,7 @@ measures. A schedule proposes a multiplier, sees the step and says whether it is
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 #: Of the free steps so many are taken within the control bounds.
@@ -28,14 +29,12 @@ class Step:
         radius: ∫ E‖x − x_k‖² dt that the step takes.
         predicted: decrease of the merit function by the convex model, ≥ 0.
         actual: decrease of the merit function; −inf where the model functions are not finite.
-        merit: merit function at the new iterate.
-        before: merit function at the current one.
+        before: merit function at the current iterate.
     """
 
     radius: float
     predicted: float
     actual: float
-    merit: float
     before: float
 
 
@@ -64,7 +63,7 @@ class TrustRegion:
 
     def judge(self, step: Step) -> bool:
         """Accept or reject, and adapt; here whatever is finite is accepted."""
-        self.collapsed = not step.actual > -float("inf")  # there is no shorter step to try
+        self.collapsed = not step.actual > -math.inf  # there is no shorter step to try
         return not self.collapsed
 
 
@@ -79,13 +78,12 @@ class PaperTrustRegion(TrustRegion):
 
     def __init__(self, radius: float = 100.0, shrink: float = 0.99) -> None:
         self.radius, self.shrink = radius, shrink
-        self._low, self._high = 0.0, float("inf")
+        self._low, self._high = 0.0, math.inf
 
     def fits(self, radius: float) -> bool:
         """Whether the step keeps Δ (to 1 %, from inside); moves the multiplier if not.
 
-        Where the dynamics alone demand a longer step (assumption A₃ fails), the shortest there
-        is passes.
+        Where the dynamics alone demand a longer step (assumption A₃ fails), the shortest passes.
         """
         if radius <= self.radius:
             tight = radius >= 0.99 * self.radius or self.multiplier == 0.0
@@ -96,7 +94,7 @@ class PaperTrustRegion(TrustRegion):
             return True
         else:
             self._low = self.multiplier
-        if self._high == float("inf"):
+        if self._high == math.inf:
             self.multiplier = max(10.0 * self.multiplier, 1e-4)
         else:
             self.multiplier = (max(self._low, 1e-3 * self._high) * self._high) ** 0.5
@@ -105,7 +103,7 @@ class PaperTrustRegion(TrustRegion):
     def judge(self, step: Step) -> bool:
         """Accept whatever is finite and shrink the radius."""
         self.radius *= self.shrink
-        self.multiplier, self._low, self._high = 0.0, 0.0, float("inf")
+        self.multiplier, self._low, self._high = 0.0, 0.0, math.inf
         return super().judge(step)
 
 
@@ -131,20 +129,18 @@ class AdaptiveTrustRegion(TrustRegion):
 
     def judge(self, step: Step) -> bool:
         """Accept or reject, and adapt the multiplier."""
-        finite = step.actual > -float("inf")
         self._free -= 1
         self.bold = self._free > _WITHIN_BOUNDS
-        if self._free >= 0 and finite:
+        if self._free >= 0 and step.actual > -math.inf:
             return True
         # The multiplier that makes the penalty as large as what the step promised.
         natural = step.predicted / max(step.radius, 1e-300)
+        ratio = step.actual / max(step.predicted, 1e-300)
         # At the end rounding errors are all that is left of both: no reason to change anything.
         noise = _MERIT_NOISE * (1.0 + abs(step.before))
-        if finite and step.predicted <= noise and step.actual >= -noise:
-            self._rejected, self.collapsed = 0, False
-            return True
-        ratio = step.actual / max(step.predicted, 1e-300)
-        if not finite or ratio < 1e-3:
+        if step.predicted <= noise and step.actual >= -noise:
+            ratio = 0.5
+        if ratio < 1e-3:
             self._rejected += 1
             self.collapsed = self._rejected > self._patience
             self.multiplier = max(4.0 * self.multiplier, 0.5 * natural) or 1.0

@@ -24,8 +24,8 @@ from slipcar.planner.extremal.maximum_principle import (
     time_slope,
 )
 from slipcar.planner.extremal.planned import Planned, model_for
-from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem.model import Model
+from slipcar.planner.records import Multipliers
 from slipcar.planner.status import Status
 
 Array = np.ndarray

@@ -8,10 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from slipcar.planner.history import Iteration
-from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem.model import Model, model_of
 from slipcar.planner.problem.protocol import Problem
+from slipcar.planner.records import Iteration, Multipliers
 from slipcar.planner.status import Status
 
 

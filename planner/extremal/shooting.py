@@ -29,9 +29,9 @@ from slipcar.planner.extremal.maximum_principle import adjoint_of, first_order, 
 from slipcar.planner.extremal.planned import Planned, model_for
 from slipcar.planner.lq.banded import PrimalDual
 from slipcar.planner.moments import covariance as moments
-from slipcar.planner.multipliers import Multipliers
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
+from slipcar.planner.records import Multipliers
 from slipcar.planner.status import Status
 
 Array = np.ndarray

@@ -12,7 +12,7 @@ in the order λ_1, d_1, λ_2, d_2, ..., d_K, ν: banded with 2n − 1 off-diagon
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -20,16 +20,8 @@ from numpy.lib.stride_tricks import as_strided
 Array = np.ndarray
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class PrimalDual:
-    """A primal-dual point, or a step.
-
-    Attributes:
-        d: deviations of nodes 1..K, (K, n).
-        e: control deviations, (K, m).
-        adjoint: λ_1..λ_K, (K, n).
-        terminal: ν, (q,).
-    """
+class PrimalDual(NamedTuple):
+    """A point or a step: d of nodes 1..K (K, n), e (K, m), λ_1..λ_K (K, n) and ν (q,)."""
 
     d: Array
     e: Array
@@ -38,22 +30,11 @@ class PrimalDual:
 
     def towards(self, other: PrimalDual, step: float) -> PrimalDual:
         """The point a fraction `step` of the way to another."""
-        return PrimalDual(
-            self.d + step * (other.d - self.d),
-            self.e + step * (other.e - self.e),
-            self.adjoint + step * (other.adjoint - self.adjoint),
-            self.terminal + step * (other.terminal - self.terminal),
-        )
+        return PrimalDual(*(a + step * (b - a) for a, b in zip(self, other, strict=True)))
 
 
 class BandedLq:
-    """LQ problems of one shape: `load` what many share, `factor` one of them, `solve` it.
-
-    Args:
-        K: intervals.
-        n: states.
-        q: terminal conditions.
-    """
+    """LQ problems of K intervals, n states, q terminal conditions: `load`, `factor`, `solve`."""
 
     def __init__(self, K: int, n: int, q: int) -> None:
         from scipy.linalg import lapack  # here: other plans do without SciPy's import time
@@ -94,23 +75,15 @@ class BandedLq:
         np.negative(self._loaded @ B.swapaxes(1, 2), out=self._at_BMB)
 
     def end(self, G: Array, held: Array, delta: Array) -> None:
-        """Take the terminal condition.
-
-        Args:
-            G: (q, n).
-            held: which rows read (G d)_j − δ_j ν_j = s_j, (q,) bool; the others read δ_j ν_j = s_j.
-            delta: δ ≥ 0, (q,).
-        """
+        """Take G (q, n): rows read G d − δ ν = s where `held` (q,), else δ ν = s; δ (q,) ≥ 0."""
         self._at_GT[...] = G.T
         np.multiply(G, held[:, None], out=self._at_G)
         np.einsum("ii->i", self._at_delta)[...] = np.where(held, -delta, delta)
 
     def factor(self, Q: Array, M: Array | None = None) -> bool:
-        """Factorise the system with Q of nodes 1..K, (K, n, n); False if it is singular.
+        """Factorise with Q of nodes 1..K (K, n, n); False if singular.
 
-        Args:
-            Q: of nodes 1..K, (K, n, n).
-            M: in place of the loaded one (where there is no S), (K, m, m).
+        M (K, m, m), where there is no S, goes in place of the loaded one.
         """
         np.copyto(self._band, self._base)
         self._BM = self._loaded
@@ -127,14 +100,7 @@ class BandedLq:
         return info == 0
 
     def solve(self, e0: Array, drift: Array, q: Array, s: Array) -> PrimalDual | None:
-        """The solution, or None if it overflows.
-
-        Args:
-            e0: e⁰, (K, m).
-            drift: f + B e⁰, (K, n).
-            q: (K, n).
-            s: (q,).
-        """
+        """The solution for e⁰ (K, m), f + B e⁰ (K, n), q (K, n), s (q,); None if it overflows."""
         K, n, _ = self.shape
         w, right = self._width, np.empty(len(self._base))
         blocks = right[: 2 * n * K].reshape(K, 2, n)

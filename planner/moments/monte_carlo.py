@@ -11,6 +11,7 @@ nearly monotone function.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -35,11 +36,10 @@ def violations(
     seed: int,
     project: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """Which paths break `problem.constraint` at a node 1..N−1.
+    """Which paths break `problem.constraint` at a node 1..N−1, (episodes,) of bool.
 
-    Starts are drawn from N(start, start_covariance).
-    A path whose state or constraint is no longer a finite number counts as one that does: nothing
-    can be promised for it.
+    Starts are drawn from N(start, start_covariance). A path whose state or constraint is no longer
+    a finite number counts as one that does: nothing can be promised for it.
 
     Args:
         problem: with `constraint(t, x)` -> (..., p), violated where > 0.
@@ -49,16 +49,12 @@ def violations(
         seed: of the Brownian paths, ≥ 0; path i depends on (seed, i) alone.
         project: applied to the controls before they act, e.g. clipping to the bounds.
 
-    Returns:
-        (episodes,) of bool.
-
     Raises:
         TypeError: if the problem lacks a required member.
         ValueError: if it has no `constraint`, if a function's result has the wrong shape, or for
             a bad number of episodes or seed.
     """
-    constraint = getattr(problem, "constraint", None)
-    if constraint is None:
+    if getattr(problem, "constraint", None) is None:
         raise ValueError(
             f"{type(problem).__name__} has no constraint(t, x) -> (..., p), violated where > 0: "
             f"without one there is no risk to measure"
@@ -68,17 +64,14 @@ def violations(
     model = model_of(problem)
     drive = control if project is None else lambda t, x: project(control(t, x))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        blocks = [
-            _violated(model, constraint, drive, _generator(seed, b), _starts(model, seed, b))
-            for b in range(-(-episodes // BLOCK))
-        ]
+        blocks = [_violated(model, drive, seed, b) for b in range(-(-episodes // BLOCK))]
     return np.concatenate(blocks)[:episodes]
 
 
-def _generator(seed: int, block: int) -> np.random.Generator:
+def _generator(seed: int, *key: int) -> np.random.Generator:
     # A spawned child, never SeedSequence((seed, block)): the paths of an evaluation come from
     # there, and a risk verified on the very paths it is later judged by would verify nothing.
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block,)))
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
 def _starts(model: Model, seed: int, block: int) -> Array:
@@ -86,35 +79,36 @@ def _starts(model: Model, seed: int, block: int) -> Array:
     x = np.tile(model.start, (BLOCK, 1))
     if model.start_covariance.any():
         # Of a stream of their own: the Brownian paths stay those of a known start.
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block, _START)))
+        normal = _generator(seed, block, _START).standard_normal(x.shape)
         values, vectors = np.linalg.eigh(model.start_covariance)
-        x += rng.standard_normal(x.shape) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        x += normal @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     return x
 
 
 def _violated(
-    model: Model,
-    constraint: Callable[[Array, Array], Array],
-    control: Callable[[float, Array], Array],
-    rng: np.random.Generator,
-    x: Array,
+    model: Model, control: Callable[[float, Array], Array], seed: int, block: int
 ) -> Array:
-    """Which paths of one block, (BLOCK,), from states x (BLOCK, n).
-
-    Always a whole block: results may round by its shape.
-    """
+    """Which paths of one block; always a whole one, (BLOCK,): results may round by its shape."""
+    problem: Any = model.problem
+    rng, x, m = _generator(seed, block), _starts(model, seed, block), model.control_dim
     violated = np.zeros(BLOCK, dtype=bool)
     for k, dt in enumerate(model.dt):
         t = np.full(BLOCK, model.times[k])  # one for each path: all functions are batched alike
-        u = _controls(control(float(model.times[k]), x), model.control_dim)
+        u = np.asarray(control(float(model.times[k]), x))
+        if u.shape not in ((m,), (BLOCK, m)):
+            raise ValueError(
+                f"control(t, x) must have shape ({BLOCK}, {m}) for {BLOCK} states, or ({m},) for "
+                f"all of them, not {u.shape}"
+            )
         sigma = model.diffusion(t, x)
         noise = np.sqrt(dt) * rng.standard_normal((BLOCK, sigma.shape[-1]))
-        x = x + dt * model.drift(t, x, u) + np.einsum("bij,bj->bi", sigma, noise)
+        moved = dt * model.drift(t, x, np.broadcast_to(u, (BLOCK, m)))
+        x = x + moved + np.einsum("bij,bj->bi", sigma, noise)
         if not np.isfinite(x.sum()):  # a sum is cheap; only when it is not finite look closer
             lost = ~np.isfinite(x).all(axis=1)
             violated |= lost
             x[lost] = model.start  # any finite state: their verdict stands
-        h = np.asarray(constraint(np.full(BLOCK, model.times[k + 1]), x))
+        h = np.asarray(problem.constraint(np.full(BLOCK, model.times[k + 1]), x))
         if h.ndim != 2 or len(h) != BLOCK:
             raise ValueError(
                 f"constraint(t, x) must have shape ({BLOCK}, p) for {BLOCK} states, not {h.shape}"
@@ -123,13 +117,3 @@ def _violated(
         if not kept.all():
             violated |= ~kept.all(axis=1)
     return violated
-
-
-def _controls(u: Array, m: int) -> Array:
-    u = np.asarray(u)
-    if u.shape not in ((m,), (BLOCK, m)):
-        raise ValueError(
-            f"control(t, x) must have shape ({BLOCK}, {m}) for {BLOCK} states, or ({m},) for all "
-            f"of them, not {u.shape}"
-        )
-    return u if u.ndim == 2 else np.broadcast_to(u, (BLOCK, m))

@@ -25,14 +25,15 @@ from slipcar.planner.problem.integrators import change
 from slipcar.planner.problem.model import Model
 from slipcar.planner.trace import machine_code
 from slipcar.planner.trace.arrays import TracedArray
-from slipcar.planner.trace.errors import TraceError
+from slipcar.planner.trace.errors import OpaqueError, TraceError
 from slipcar.planner.trace.graph import Expression, Graph, jacobian
 from slipcar.planner.trace.tracing import trace_call
 
 Array = np.ndarray
 
-#: Points at which a known trace is held against the problem's functions, and how near it must come.
-_PROBES, _AGREEMENT = 2, 1e-9
+#: Points at which a trace is held against the problem's functions, and how near it must come: to
+#: each value, and to rounding of the largest.
+_PROBES, _AGREEMENT, _ROUNDING = 2, 1e-9, 2e-15
 #: Traces kept for a kind of problem that names its numbers.
 _TRACES = 4
 
@@ -127,6 +128,9 @@ def pose(model: Model, *, constraints: bool = False, compiled: bool | None = Non
         machine_code.tell_once("llvmlite is missing: plans take some hundred times longer")
     try:
         traced = _trace_of(model, constraints, native)
+        if traced is None:
+            model.jacobians.distrust(_OTHER_VALUES)
+            raise OpaqueError(_OTHER_VALUES)
     except TraceError as error:
         if compiled:
             raise ValueError(
@@ -145,11 +149,26 @@ def pose(model: Model, *, constraints: bool = False, compiled: bool | None = Non
 _kinds: dict[Any, list[Posed]] = {}
 
 
-def _trace_of(model: Model, constraints: bool, native: bool) -> Posed:
-    """A known trace of the kind that agrees with the problem now, or a new one."""
+#: Said of functions that depend on more than their arguments, or on their arguments' types.
+_OTHER_VALUES = "traced, they give other values than called (do they depend on anything else?)"
+
+
+def _trace_of(model: Model, constraints: bool, native: bool) -> Posed | None:
+    """A trace that says what the problem's functions say now, known or new; None if none does."""
     named = _parameters(model.problem)
-    if named is None:
-        return _traced(model, constraints, {})
+    posed = None if named is None else _named_trace(model, constraints, native, named)
+    if posed is None:
+        # None are named, or not all, or another's: a problem wrapped round one.
+        posed = _traced(model, constraints, {})
+        if not _agrees(posed, constraints, native):
+            return None
+    return posed
+
+
+def _named_trace(
+    model: Model, constraints: bool, native: bool, named: dict[str, Array]
+) -> Posed | None:
+    """A trace with the numbers that a problem names as parameters, if it agrees with it."""
     kind = (
         getattr(model.problem, "_kind", type(model.problem)), model.integrator, constraints,
         tuple((name, value.shape) for name, value in named.items()), len(model.weight),
@@ -168,10 +187,9 @@ def _trace_of(model: Model, constraints: bool, native: bool) -> Posed:
     try:
         posed = _traced(model, constraints, named)
     except (TraceError, AttributeError):
-        return _traced(model, constraints, {})
+        return None
     if not _agrees(posed, constraints, native):
-        # The numbers it names are not all, or are another's: a problem wrapped round one.
-        return _traced(model, constraints, {})
+        return None
     # Without its model, lest the problem live for ever.
     known.insert(0, posed.of(None))
     del known[_TRACES:]
@@ -259,14 +277,28 @@ def check_assumptions(posed: Posed, x: Array, u: Array, *, charged: bool) -> Non
         ValueError: naming the function, the entry and what is assumed of it.
     """
     known = _structures.get(posed.structure)
-    facts = known[1] if known is not None and posed.structure in _checked else None
-    checks.check(posed.model, x, u, facts, charged=charged)
-    if known is not None:
-        _checked.add(posed.structure)
+    if known is None:
+        checks.check(posed.model, x, u, None, charged=charged)
+        return
+    # The same lines of code, whatever numbers they read.
+    functions = [getattr(posed.model.problem, name, None) for name in _FUNCTIONS]
+    lines = [getattr(getattr(f, "__func__", f), "__code__", type(f)) for f in functions]
+    kind = (posed.structure, *lines)
+    if kind not in _checked:
+        checks.check(posed.model, x, u, None, charged=charged)
+        checks.check_given(posed.model, x, u)
+        _checked.add(kind)
+        return
+    checks.check(posed.model, x, u, known[1], charged=charged)
 
 
-#: Structures whose functions were looked at.
-_checked: set[bytes] = set()
+#: Structures, with the code they come from, whose functions were looked at.
+_checked: set[tuple[Any, ...]] = set()
+_FUNCTIONS = (
+    "drift", "diffusion", "penalty", "terminal", "state_cost", "control_cost", "drift_jacobian",
+    "diffusion_jacobian", "penalty_jacobian", "terminal_jacobian", "state_cost_derivatives",
+    "control_cost_jacobian",
+)  # fmt: skip
 
 
 def _facts(traced: Traced, b: Array) -> checks.Facts:
@@ -293,19 +325,27 @@ def _agrees(posed: Posed, constraints: bool, native: bool) -> bool:
         return False
     if given.shape[1] != len(problem.entries):
         return False
-    values = problem.values
+    dt = float(model.dt[0])
     if native:
         known = problem.programs
         if "probe" not in known:
             known["probe"] = Probe(problem, posed.structure, _PROBES)
-        values = known["probe"]
-    traced = values(t, float(model.dt[0]), x, u, posed.numbers)
-    off = np.abs(traced - given)
-    size = np.abs(given)
-    if (off <= _AGREEMENT * (size + size.max())).all():
+        if _near(known["probe"](t, dt, x, u, posed.numbers), given):
+            return True
+    # As NumPy rounds, where machine code rounds otherwise.
+    return _near(problem.values(t, dt, x, u, posed.numbers), given)
+
+
+def _near(traced: Array, given: Array) -> bool:
+    """Whether values are equal but for rounding; where neither is finite, they are."""
+    size, off = np.abs(given), np.abs(traced - given)
+    if (off <= _AGREEMENT * size + _ROUNDING * size.max()).all():
         return True
-    same = (np.isnan(traced) & np.isnan(given)) | (traced == given)
-    return bool((same | (off <= _AGREEMENT * (size + size.max(axis=1, keepdims=True)))).all())
+    finite = np.isfinite(given)
+    if not finite.any() or not np.array_equal(finite, np.isfinite(traced)):
+        return False
+    size = size[finite]
+    return bool((off[finite] <= _AGREEMENT * size + _ROUNDING * size.max()).all())
 
 
 @functools.lru_cache(maxsize=64)
@@ -322,17 +362,15 @@ def _probe_points(model: Model) -> tuple[Array, Array, Array]:
 
 
 def _called(model: Model, constraints: bool, t: Array, x: Array, u: Array) -> Array:
-    """The problem's functions at some points, in the order of `Traced.values`."""
+    """The problem's functions at some points, in the order of `Traced.entries`."""
     problem: Any = model.problem
     moved = change(model.integrator, problem.drift, t, model.dt[0], x, u)
     values = [x + moved, problem.diffusion(t, x)]
-    if model.has("control_cost"):
-        values.append(problem.control_cost(t, x))
+    values.append(problem.control_cost(t, x) if model.has("control_cost") else np.zeros_like(u))
     for name in ("penalty", "constraint"):
         if _wanted(model, name, constraints):
             values.append(getattr(problem, name)(t, x))
-    if model.has("state_cost"):
-        values.append(problem.state_cost(t, x))
+    values.append(problem.state_cost(t, x) if model.has("state_cost") else np.zeros_like(t))
     values.append(problem.terminal(x))
     rows = [np.asarray(value, dtype=np.float64).reshape(len(t), -1) for value in values]
     return np.concatenate(rows, axis=1)

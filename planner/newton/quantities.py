@@ -106,11 +106,7 @@ class Traced:
     @functools.cached_property
     def entries(self) -> list[Expression]:
         """x⁺, σ, ℓ, c, H and g in one row, as the problem's functions are called."""
-        parts = [self.next, self.sigma, self.c, self.g]
-        if any(not e.is_zero for e in self.ell):
-            parts.insert(2, self.ell)
-        if self.state_cost:
-            parts.insert(-1, np.array([self.H], dtype=object))
+        parts = (self.next, self.sigma, self.ell, self.c, np.array([self.H]), self.g)
         return [self.graph.lift(e) for part in parts for e in np.ravel(part)]
 
     def values(self, t: Array, dt: float, x: Array, u: Array, number: Array) -> Array:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.problem.answers import answers
-from slipcar.planner.problem.jacobians import differences, richardson
+from slipcar.planner.problem.jacobians import Jacobians, differences, richardson
 from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
@@ -178,6 +178,32 @@ def _reach(path: dict[int, str], i: int, by: int) -> int:
 
 
 @_quiet
+def check_given(model: Model, x: Array, u: Array) -> None:
+    """Derivatives that the problem gives against those of its traced functions.
+
+    Newton's method takes the latter; the rest of the planner the former.
+
+    Raises:
+        ValueError: naming the function, the entry and both values.
+    """
+    exact = Jacobians(model.problem, model.state_dim, model.control_dim, given=False)
+    t, y, v = _points(model, x, u)
+    pairs: list[tuple[str, Any, Any]] = []
+    if model.jacobians.is_given("drift"):
+        both = zip(model.jacobians.drift(t, y, v), exact.drift(t, y, v), strict=True)
+        pairs += [(f"drift_jacobian[{i}]", *pair) for i, pair in enumerate(both)]
+    for name in ("diffusion", "penalty", "control_cost", "terminal"):
+        if model.has(name) and model.jacobians.is_given(name):
+            slopes = (j.state(name, t, y) for j in (model.jacobians, exact))
+            pairs.append((f"{name}_jacobian", *slopes))
+    if model.jacobians.is_given("state_cost"):
+        both = zip(model.jacobians.state_cost(t, y), exact.state_cost(t, y), strict=True)
+        pairs += [(f"state_cost_derivatives[{i}]", *pair) for i, pair in enumerate(both)]
+    for name, given, traced in pairs:
+        _refuse_difference(model, name, np.asarray(given), traced, 0.0 * np.abs(traced), y)
+
+
+@_quiet
 def check_derivatives(model: Model, x: Array, u: Array) -> None:
     """Every Jacobian, given or traced, against central differences.
 
@@ -211,16 +237,22 @@ def check_derivatives(model: Model, x: Array, u: Array) -> None:
 def _compare(model: Model, name: str, given: Array, f: Callable[[Array], Any], x: Array) -> None:
     """Raise where a Jacobian (P, ..., n) is not what differences of f with respect to x are."""
     best, spread = richardson(lambda step: differences(f, x, step))
+    allowed = 10.0 * spread + 1e-9 * (1.0 + np.nanmax(np.abs(np.asarray(f(x))), initial=0.0))
+    _refuse_difference(model, name, given, best, allowed, x)
+
+
+def _refuse_difference(
+    model: Model, name: str, given: Array, best: Array, allowed: Array, x: Array
+) -> None:
+    """Raise where two Jacobians (P, ..., n) at points x (P, n) are further apart than allowed."""
     size = np.maximum(np.abs(given), np.abs(best))
-    allowed = _JACOBIAN * (size + _largest(size)) + 10.0 * spread
-    allowed += 1e-9 * (1.0 + np.nanmax(np.abs(np.asarray(f(x))), initial=0.0))
-    wrong = np.abs(given - best) > allowed
+    wrong = np.abs(given - best) > allowed + _JACOBIAN * (size + _largest(size))
     if not wrong.any():
         return
     index = tuple(int(i) for i in np.argwhere(wrong)[0])
-    analytic = getattr(model.problem, name.split("[")[0], None) is not None
-    source = "your function" if analytic else "traced"
-    advice = "" if analytic else "; is the function smooth there? otherwise give its derivative"
+    own = getattr(model.problem, name.split("[")[0], None) is not None
+    source = "your function" if own else "traced"
+    advice = "" if own else "; is the function smooth there? otherwise give its derivative"
     raise ValueError(
         f"{name}{list(index[1:])} ({source}) is {given[index]:.9g} at "
         f"{_show(x[index[0]])}, but differences give {best[index]:.9g}{advice}"

@@ -37,13 +37,15 @@ class Jacobians:
         problem: whose functions they are.
         n: states.
         m: controls.
+        given: whether derivatives that the problem gives are taken.
 
     Attributes:
         differenced: names of the functions that are differentiated numerically, and why.
     """
 
-    def __init__(self, problem: Any, n: int, m: int) -> None:
-        self.problem, self.n, self.m = problem, n, m
+    def __init__(self, problem: Any, n: int, m: int, *, given: bool = True) -> None:
+        self.problem, self.n, self.m, self._takes_given = problem, n, m, given
+        self._distrust = ""
         self.differenced: dict[str, str] = {}
         self._made: dict[str, Slopes] = {}
 
@@ -83,8 +85,13 @@ class Jacobians:
         suffix = "derivatives" if name == "state_cost" else "jacobian"
         return self._given(f"{name}_{suffix}") is not None
 
+    def distrust(self, reason: str) -> None:
+        """Take no derivatives from traces: they do not say what the functions say."""
+        self._distrust = reason
+        self._made.clear()
+
     def _given(self, name: str) -> Callable[..., Any] | None:
-        return getattr(self.problem, name, None)
+        return getattr(self.problem, name, None) if self._takes_given else None
 
     def _slopes(self, name: str) -> Slopes:
         if name not in self._made:
@@ -93,6 +100,8 @@ class Jacobians:
 
     def _traced_or_differences(self, name: str) -> Slopes:
         try:
+            if self._distrust:
+                raise OpaqueError(self._distrust)
             return self._traced(name)
         except OpaqueError as error:
             self.differenced[name] = str(error)
@@ -172,10 +181,9 @@ def differences(f: Callable[[Array], Array], x: Array, step: float) -> Array:
         ahead[..., i] += h[..., i]
         behind[..., i] -= h[..., i]
         rise = np.asarray(f(ahead)) - np.asarray(f(behind))
-        width = (ahead[..., i] - behind[..., i]).reshape(
-            *x.shape[:-1], *[1] * (rise.ndim - x.ndim + 1)
-        )
-        columns.append(rise / width)
+        width = ahead[..., i] - behind[..., i]
+        shape = (*x.shape[:-1], *[1] * (rise.ndim - x.ndim + 1))
+        columns.append(rise / np.reshape(width, shape))
     return np.stack(columns, axis=-1)
 
 

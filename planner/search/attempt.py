@@ -15,18 +15,19 @@ import dataclasses
 import numpy as np
 
 from slipcar.planner.convex import iteration
-from slipcar.planner.convex.solvers.interface import Solver
 from slipcar.planner.convex.solvers.registry import make_solver
 from slipcar.planner.convex.trust_region import TRUST_REGIONS
-from slipcar.planner.history import Iteration
-from slipcar.planner.newton.posing import Posed
+from slipcar.planner.newton.posing import Posed, check_assumptions, pose
 from slipcar.planner.newton.running import solve_mean
 from slipcar.planner.newton.tuning import MEAN
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
+from slipcar.planner.problem import checks
 from slipcar.planner.problem.feasibility import FEASIBILITY, inconsistency
 from slipcar.planner.problem.linearization import linearize
-from slipcar.planner.problem.model import Model
+from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.problem.protocol import Problem
+from slipcar.planner.records import Iteration
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -37,85 +38,87 @@ Array = np.ndarray
 _OWN, _SHARED = 60, 0.25
 
 
-def attempt(
-    model: Model,
-    posed: Posed | None,
-    options: Options,
-    x: Array,
-    u: Array,
-    *,
-    free_first: bool,
-    history: bool = True,
-) -> Outcome:
-    """Plan from one guess.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """A problem and where to start."""
 
-    Args:
-        model: the problem.
-        posed: the same for Newton's method; None runs the convex scheme.
-        options: of the iteration.
-        x: states, (N, n).
-        u: controls, (K, m).
-        free_first: leave the penalties out at first.
-        history: keep every step.
+    model: Model
+    posed: Posed | None  #: the same for Newton's method; None runs the convex scheme
+    x: Array  #: guess, (N, n)
+    u: Array  #: guess, (K, m)
+    free_first: bool = False  #: whether to leave penalties out at first
+    label: str = ""  #: for people
+
+
+def completed(problem: Problem, options: Options) -> Model:
+    """The problem, checked, with the integrator asked for."""
+    model = model_of(problem)
+    if options.integrator == model.integrator:
+        return model
+    return dataclasses.replace(model, integrator=options.integrator)
+
+
+def posed_for(model: Model, options: Options, x: Array, u: Array, *, charged: bool) -> Posed | None:
+    """The problem for Newton's method, or None for the convex one; assumptions hold near x, u.
+
+    Raises:
+        ValueError: for an assumption that does not, or if Newton's method is asked for and cannot
+            pose the problem.
+    """
+    ball = model.radius < np.inf
+    if ball and options.method == "newton":
+        raise ValueError("method='newton' knows no control_radius: leave method out")
+    if ball and options.compiled:
+        raise ValueError("compiled=True is of Newton's method, which knows no control_radius")
+    if ball or options.convex:
+        checks.check(model, x, u, None, charged=charged)
+        return None
+    posed = pose(model, compiled=options.compiled)
+    check_assumptions(posed, x, u, charged=charged)
+    return posed
+
+
+def attempt(task: Task, options: Options, *, history: bool = True) -> Outcome:
+    """Plan from one guess; `history` keeps every step.
 
     Raises:
         ValueError: if a function of the problem is not finite along the guess.
     """
-    if posed is None:
-        return _convex(model, options, x, u, free_first)
-    if posed.model is not model:
-        posed = posed.of(model)
-    limited = _newton_options(options)
-    outcome = solve_mean(posed, limited, x, u, free_first=free_first, history=history)
+    if task.posed is None:
+        return _convex(task, options)
+    posed = task.posed if task.posed.model is task.model else task.posed.of(task.model)
+    limit = options.max_iterations
+    if limit > _OWN:
+        limit = _OWN + int(_SHARED * (limit - _OWN))
+    outcome = solve_mean(
+        posed, options.with_iterations(limit), task.x, task.u, free_first=task.free_first,
+        history=history,
+    )  # fmt: skip
     if outcome.status in (Status.CONVERGED, Status.STOPPED):
         return outcome
-    return _second_chance(model, options, x, u, outcome)
-
-
-def uses_newton(model: Model, options: Options) -> bool:
-    """Whether Newton's method is asked for, or nothing speaks against it.
-
-    Raises:
-        ValueError: if it is asked for and cannot pose the problem.
-    """
-    if options.method == "newton" and model.radius < np.inf:
-        raise ValueError("method='newton' knows no control_radius: leave method out")
-    if options.compiled and model.radius < np.inf:
-        raise ValueError("compiled=True is of Newton's method, which knows no control_radius")
-    return options.method != "convex" and not options.only_convex and model.radius == np.inf
-
-
-def _newton_options(options: Options) -> Options:
-    """The options, with fewer iterations where some are left to the convex scheme."""
-    if options.max_iterations <= _OWN:
-        return options
-    limit = _OWN + int(_SHARED * (options.max_iterations - _OWN))
-    return options.with_iterations(limit)
-
-
-def _second_chance(model: Model, options: Options, x: Array, u: Array, newton: Outcome) -> Outcome:
-    """What the convex iteration makes of a guess that Newton's method failed at."""
-    left = options.max_iterations - newton.iterations
+    left = options.max_iterations - outcome.iterations
     if left <= 0:
-        return _explained(model, options, newton)
-    convex = _convex(model, options.with_iterations(left), x, u, False)
-    say = f"Newton's method ended {newton.status} after {newton.iterations} iterations"
-    history = (*newton.history, *convex.history)
-    iterations = newton.iterations + convex.iterations
-    return dataclasses.replace(convex, iterations=iterations, history=history).said(say)
+        return _explained(task.model, options, outcome)
+    second = dataclasses.replace(task, free_first=False)
+    convex = _convex(second, options.with_iterations(left))
+    return dataclasses.replace(
+        convex,
+        iterations=outcome.iterations + convex.iterations,
+        history=(*outcome.history, *convex.history),
+    ).said(f"Newton's method ended {outcome.status} after {outcome.iterations} iterations")
 
 
-def _convex(model: Model, options: Options, x: Array, u: Array, free_first: bool) -> Outcome:
+def _convex(task: Task, options: Options) -> Outcome:
+    model, x, u = task.model, task.x, task.u
     before: tuple[Iteration, ...] = ()
-    if free_first and model.weight.any():
+    if task.free_first and model.weight.any():
         free = _without_penalties(model, options, x, u)
         if free.status is Status.STOPPED:
             penalty = linearize(model, free.x, free.u).penalty  # which it did without
             return dataclasses.replace(free, penalty=penalty, objective=free.objective + penalty)
         x, u, before = free.x, free.u, tuple(free.history)
         options = options.with_iterations(max(1, options.max_iterations - len(before)))
-    trust = TRUST_REGIONS[options.trust_region or "adaptive"]()
-    outcome = iteration.iterate(model, _solver(options.solver), trust, options, x, u)
+    outcome = _iterate(model, options, x, u)
     history = (*before, *outcome.history)
     outcome = dataclasses.replace(outcome, iterations=len(history), history=history)
     return _explained(model, options, outcome)
@@ -133,10 +136,15 @@ def _without_penalties(model: Model, options: Options, x: Array, u: Array) -> Ou
     free = dataclasses.replace(model, weight=np.zeros_like(model.weight))
     few = min(MEAN.released_steps, options.max_iterations)
     hasty = dataclasses.replace(options, max_iterations=few, callback=settled)
-    trust = TRUST_REGIONS[options.trust_region or "adaptive"]()
-    outcome = iteration.iterate(free, _solver(options.solver), trust, hasty, x, u)
+    outcome = _iterate(free, hasty, x, u)
     status = Status.STOPPED if stopped else Status.MAX_ITERATIONS
     return dataclasses.replace(outcome, status=status)
+
+
+def _iterate(model: Model, options: Options, x: Array, u: Array) -> Outcome:
+    solver = make_solver(options.solver) if isinstance(options.solver, str) else options.solver
+    trust = TRUST_REGIONS[options.trust_region or "adaptive"]()
+    return iteration.iterate(model, solver, trust, options, x, u)
 
 
 def _explained(model: Model, options: Options, outcome: Outcome) -> Outcome:
@@ -151,7 +159,3 @@ def _explained(model: Model, options: Options, outcome: Outcome) -> Outcome:
         return outcome.said(f"the terminal condition is not met: {', '.join(far)}")
     off = inconsistency(at, np.inf)
     return outcome.said(f"steps are not short yet; the mean is {off:.2g} off the controls' path")
-
-
-def _solver(given: str | Solver) -> Solver:
-    return make_solver(given) if isinstance(given, str) else given

@@ -20,6 +20,7 @@ from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.posing import Posed, pose
 from slipcar.planner.newton.running import Steered, solve_noise
 from slipcar.planner.options import Options
+from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import ExpectedCost
 
@@ -55,71 +56,63 @@ def charged(model: Model, stakes: Stakes, plan: Steered) -> float:
     value = expected_cost(model, stakes, plan).total
     if stakes.tails:
         c, s = plan.c[:, -stakes.tails :], plan.s[:, -stakes.tails :]
-        value += float(
-            loss(c, s, np.full(c.shape, stakes.price), np.ones(c.shape[1], bool)).value.sum()
-        )
+        price = np.full(c.shape, stakes.price)
+        value += float(loss(c, s, price, np.ones(c.shape[1], bool)).value.sum())
     return value + stakes.variance_weight * trace_integral(plan.covariance, model.dt)
 
 
 class Field:
-    """Candidates and what became of them, price by price.
-
-    Args:
-        model: the problem.
-        options: of the iteration.
-        stakes: what is charged.
-        guesses: means (N, n) and controls (K, m), the most promising first.
+    """Candidates, plans of the mean with the most promising first, and their answers at each price.
 
     Attributes:
         steps: Newton steps so far.
-        attempt: the last answer to the first guess, whether or not it converged.
+        attempt: the last answer of the first candidate, whether or not it converged.
     """
 
     attempt: Steered
 
     def __init__(
-        self, model: Model, options: Options, stakes: Stakes, guesses: Sequence[tuple[Array, Array]]
+        self, model: Model, options: Options, stakes: Stakes, candidates: Sequence[Outcome]
     ) -> None:
         self.steps = 0
         self._model, self._stakes, self._options = model, stakes, options
-        self._guesses = list(guesses)
-        self._answers: list[list[tuple[float, Steered]]] = [[] for _ in guesses]
-        self._alive = list(range(len(self._guesses)))
-        self._origin: dict[int, int] = {}
+        self._candidates = candidates
+        self._answers: list[list[tuple[float, Steered]]] = [[] for _ in candidates]
+        self._alive = list(range(len(candidates)))
 
     @functools.cached_property
-    def guarded(self) -> Posed:
+    def _guarded(self) -> Posed:
         """The problem with its constraints as rows."""
         return pose(self._model, constraints=True, compiled=self._options.compiled)
 
     @functools.cached_property
-    def free(self) -> Posed:
+    def _free(self) -> Posed:
         """The problem with its penalties alone as rows."""
         return pose(self._model, compiled=self._options.compiled)
 
     def solve(self, price: float) -> Steered | None:
         """The best converged plan at a price, or None."""
         stakes = self._stakes.at_price(price)
-        worth: dict[int, tuple[float, Steered]] = {}
+        worth: list[tuple[float, int, Steered]] = []
         for i in self._alive:
-            plan = self._one(i, price, stakes)
+            plan = self._steered(i, price, stakes)
             if plan.status.ok:
                 self._answers[i].append((price, plan))
-                self._origin[id(plan)] = i  # it stays alive, in the line above
-                worth[i] = (charged(self._model, stakes, plan), plan)
-        order = sorted(worth, key=lambda i: worth[i][0])
-        if not order:
+                worth.append((charged(self._model, stakes, plan), i, plan))
+        if not worth:
             return None
-        best = worth[order[0]][0]
+        worth.sort(key=lambda row: row[0])
+        least, _, best = worth[0]
         # One that fails, warm and cold, while another does not, is not tried again either.
-        behind, kept = (_BEHIND, _KEPT) if price > 0.0 else (_FREE, len(order))
-        near = [i for i in order if worth[i][0] <= best + (behind - 1.0) * abs(best)]
-        self._alive = near[:kept]
-        return worth[order[0]][1]
+        behind, kept = (_BEHIND, _KEPT) if price > 0.0 else (_FREE, len(worth))
+        limit = least + (behind - 1.0) * abs(least)
+        self._alive = [i for cost, i, _ in worth if cost <= limit][:kept]
+        return best
 
     def origin(self, plan: Steered) -> int:
-        """Which guess an answer comes from."""
-        return self._origin.get(id(plan), 0)
+        """Which candidate an answer comes from."""
+        known = ((i, other) for i, answers in enumerate(self._answers) for _, other in answers)
+        return next((i for i, other in known if other is plan), 0)
 
     def cost(self, plan: Steered) -> ExpectedCost:
         """What a plan costs in expectation, with the risk predicted for it."""
@@ -127,46 +120,39 @@ class Field:
 
     def predicted_risk(self, plan: Steered) -> float:
         """Σ Φ(h/s) over nodes and constraints, at most 1: Boole's bound."""
-        if not self._stakes.constraints:
-            return 0.0
         tails = self._stakes.constraints
-        if plan.c.shape[1] == tails + len(self._stakes.penalties):
-            c, s = plan.c[:, -tails:], plan.s[:, -tails:]
-        else:
-            c, s = self.guarded.row_moments(plan.x, plan.covariance)
-            c, s = c[:, -tails:], s[:, -tails:]
-        return min(1.0, float(normal_cdf(c / s).sum()))
+        if not tails:
+            return 0.0
+        c, s = plan.c, plan.s
+        if c.shape[1] != tails + len(self._stakes.penalties):
+            c, s = self._guarded.row_moments(plan.x, plan.covariance)
+        return min(1.0, float(normal_cdf(c[:, -tails:] / s[:, -tails:]).sum()))
 
-    def _one(self, i: int, price: float, stakes: Stakes) -> Steered:
-        """Candidate i, warm from its nearest price; if that fails, from its guess."""
-        warm = min(
-            self._answers[i],
-            key=lambda known: abs(math.log((known[0] + 1e-9) / (price + 1e-9))),
-            default=None,
-        )
-        plan = self._run(i, stakes, None if warm is None else warm[1])
-        if not plan.status.ok and warm is not None:
-            plan = self._run(i, stakes, None)
-        return plan
+    def _steered(self, i: int, price: float, stakes: Stakes) -> Steered:
+        """Candidate i, warm from its answer at the nearest price; if that fails, from its guess."""
+        known = self._answers[i]
+        if known:
+            nearest = min(known, key=lambda row: abs(math.log((row[0] + 1e-9) / (price + 1e-9))))
+            plan = self._run(i, stakes, nearest[1])
+            if plan.status.ok:
+                return plan
+        return self._run(i, stakes, None)
 
     def _run(self, i: int, stakes: Stakes, warm: Steered | None) -> Steered:
-        x, u = self._guesses[i] if warm is None else (warm.x, warm.u)
+        start = self._candidates[i] if warm is None else warm
         plan = solve_noise(
-            self.guarded if stakes.priced else self.free, stakes, x, u,
+            self._guarded if stakes.priced else self._free, stakes, start.x, start.u,
             tolerance=self._options.tolerance, max_iterations=self._options.max_iterations,
             warm=None if warm is None else _with_rows(warm, len(stakes.weight)),
         )  # fmt: skip
         self.steps += plan.iterations
-        if i == 0 or not hasattr(self, "attempt"):
+        if i == 0:
             self.attempt = plan
         return plan
 
 
 def _with_rows(plan: Steered, rows: int) -> Steered:
     """The plan with weights of so many rows: those that it does not know weigh nothing."""
-    K, known = plan.eta.shape
-    if known == rows:
-        return plan
-    eta = np.zeros((K, rows))
-    eta[:, : min(known, rows)] = plan.eta[:, : min(known, rows)]
-    return dataclasses.replace(plan, eta=eta)
+    known = plan.eta[:, :rows]
+    unknown = np.zeros((len(known), rows - known.shape[1]))
+    return dataclasses.replace(plan, eta=np.hstack([known, unknown]))

@@ -17,19 +17,17 @@ not; and each plan starts from the one before, so that it takes a few Newton ste
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from slipcar.planner.extremal.maximum_principle import first_order, time_slope
-from slipcar.planner.history import Iteration
 from slipcar.planner.newton.posing import Posed
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model
-from slipcar.planner.records import TimeStep
-from slipcar.planner.search.attempt import attempt
+from slipcar.planner.records import Iteration, TimeStep
+from slipcar.planner.search.attempt import Task, attempt
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -39,26 +37,12 @@ _FIRST_RADIUS, _LARGEST_RADIUS, _SHRINK, _GROW = 0.2, 0.5, 0.25, 2.0
 #: Stop when a step is this short relative to T, or the transversality residual this small
 #: relative to the mean cost per time; give up after so many plans.
 _SHORTEST, _TRANSVERSALITY, _PLANS = 1e-9, 1e-9, 40
-#: Tolerance of the plans.
+#: Tolerance of the plans: the slope is only as good as the plan it is taken at.
 _PRECISE = 1e-12
 #: Relative accuracy of V + c T: below it the slope decides.
 _NOISE = 1e-7
-
-
-@dataclasses.dataclass(frozen=True)
-class _Point:
-    model: Model
-    outcome: Outcome
-    T: float
-    objective: float
-    slope: float
-
-
-def dilated(model: Model, final_time: float) -> Model:
-    """The model on a time grid stretched to last `final_time` seconds."""
-    begin, horizon = model.times[0], model.times[-1] - model.times[0]
-    times = begin + (model.times - begin) * (final_time / horizon)
-    return dataclasses.replace(model, times=times, dt=np.diff(times))
+#: How much longer the horizon becomes where none was planned yet.
+_LONGER = 1.5
 
 
 def checked_bounds(model: Model, given: Any) -> tuple[float, float]:
@@ -85,120 +69,122 @@ def free_final_time(
     model: Model,
     posed: Posed | None,
     options: Options,
-    found: Outcome,
+    nominal: Outcome,
     *,
     time_weight: float,
     bounds: tuple[float, float],
 ) -> tuple[Model, Outcome, tuple[TimeStep, ...]]:
-    """Search for the final time.
+    """Search for the final time within bounds [s], from the plan `nominal` at the model's own.
 
-    Args:
-        model: the problem; its horizon is the first that was tried.
-        posed: the same for Newton's method, or None.
-        options: of the iteration.
-        found: the plan there.
-        time_weight: c, cost per second.
-        bounds: least and largest T [s].
+    `time_weight` is c, the cost of a second.
 
     Returns:
         The model at the best horizon, its outcome (MAX_ITERATIONS if the search did not settle at
         a root of the slope or against a bound, STOPPED by the callback), and every horizon tried.
     """
-    if found.status is Status.STOPPED:
-        return model, found, ()
-    model, best, steps, settled = _search(model, posed, options, found, time_weight, bounds)
-    # Horizons that were not taken are told of in `steps` alone.
-    history = tuple(row for step, rows in steps if step.accepted for row in rows)
-    tried = sum(step.iterations for step, _ in steps)
-    best = dataclasses.replace(best, iterations=tried, history=history)
-    horizon = model.times[-1] - model.times[0]
-    if best.status is Status.STOPPED:
-        return model, best, tuple(step[0] for step in steps)
-    if not best.status.ok:
-        best = best.said(f"none of the horizons tried, up to {horizon:g} s, gave a plan")
+    if nominal.status is Status.STOPPED:
+        return model, nominal, ()
+    precise = dataclasses.replace(options, tolerance=min(options.tolerance, _PRECISE))
+    search = _Search(model, posed, precise, time_weight, bounds)
+    best, settled = search.planned(nominal), False
+    if best.outcome.status.ok:
+        best, settled = search.settled(best)
+    steps = tuple(search.steps)
+    tried = sum(step.iterations for step in steps)
+    outcome = dataclasses.replace(best.outcome, iterations=tried, history=tuple(search.history))
+    if outcome.status is Status.STOPPED:
+        return best.model, outcome, steps
+    horizon = best.model.times[-1] - best.model.times[0]
+    if not outcome.status.ok:
+        outcome = outcome.said(f"none of the horizons tried, up to {horizon:g} s, gave a plan")
     elif not settled:
-        best = dataclasses.replace(best, status=Status.MAX_ITERATIONS).said(
+        outcome = dataclasses.replace(outcome, status=Status.MAX_ITERATIONS).said(
             f"the final time did not settle within {len(steps)} plans"
         )
     elif np.isclose(horizon, bounds, rtol=_SHORTEST, atol=0.0).any():
-        best = best.said("the final time is at its bound")
-    return model, best, tuple(step[0] for step in steps)
+        outcome = outcome.said("the final time is at its bound")
+    return best.model, outcome, steps
 
 
-def _search(
-    model: Model,
-    posed: Posed | None,
-    options: Options,
-    found: Outcome,
-    time_weight: float,
-    bounds: tuple[float, float],
-) -> tuple[Model, Outcome, list[tuple[TimeStep, Sequence[Iteration]]], bool]:
-    variance_weight = options.variance_weight
-    # The slope is only as good as the plan it is taken at.
-    precise = dataclasses.replace(options, tolerance=min(options.tolerance, _PRECISE))
+class _Point(NamedTuple):
+    """A horizon T, what came of it, V + c T and its slope."""
 
-    def at(T: float, x: Array, u: Array) -> _Point:
-        there = dilated(model, T)
-        outcome = attempt(there, posed, precise, x, model.admissible(u), free_first=False)
-        slope, objective = np.nan, np.inf
-        if outcome.status.ok:
-            first = first_order(there, outcome.x, outcome.u, variance_weight)
-            slope = time_slope(there, first, outcome.adjoint, variance_weight) + time_weight
-            objective = outcome.objective + time_weight * T
-        return _Point(there, outcome, T, objective, slope)
-
-    low, high = bounds
-    T = float(np.clip(model.times[-1] - model.times[0], low, high))
-    best = at(T, found.x, found.u)
-    radius = _FIRST_RADIUS * T
-    steps = [_step(best, radius, True)]
-    # Effort falls with the third power of the horizon where the way is long: a first curvature.
-    curvature = 12.0 * max(best.objective - time_weight * T, 0.0) / T**2
-    for _ in range(_PLANS):
-        if best.outcome.status is Status.STOPPED:
-            return best.model, best.outcome, steps, False
-        if not best.outcome.status.ok:
-            if high <= best.T:
-                return best.model, best.outcome, steps, False
-            # Too short a horizon is the usual reason.
-            best = at(min(best.T * 1.5, high), found.x, found.u)
-            steps.append(_step(best, radius, True))
-            curvature = 12.0 * max(best.objective - time_weight * best.T, 0.0) / best.T**2
-            continue
-        if abs(best.slope) <= _TRANSVERSALITY * best.objective / best.T:
-            return best.model, best.outcome, steps, True
-        wish = -best.slope / curvature if curvature > 0.0 else -np.sign(best.slope) * np.inf
-        T = float(np.clip(best.T + np.clip(wish, -radius, radius), low, high))
-        if abs(T - best.T) <= _SHORTEST * best.T:
-            settled = T in bounds or abs(wish) <= radius
-            return best.model, best.outcome, steps, settled
-        new = at(T, best.outcome.x, best.outcome.u * (best.T / T))
-        if new.outcome.status is Status.STOPPED:
-            steps.append(_step(new, radius, False))
-            stopped = dataclasses.replace(best.outcome, status=Status.STOPPED)
-            return best.model, stopped, steps, False
-        noise = _NOISE * abs(best.objective)
-        better = new.objective < best.objective - noise or (
-            new.objective < best.objective + noise and abs(new.slope) < abs(best.slope)
-        )
-        if np.isfinite(new.slope):
-            curvature = (new.slope - best.slope) / (new.T - best.T)
-        steps.append(_step(new, radius, better))
-        if better:
-            radius = min(_GROW * radius, _LARGEST_RADIUS * new.T)
-            best = new
-        else:
-            radius = _SHRINK * abs(new.T - best.T)
-    return best.model, best.outcome, steps, False
+    model: Model
+    outcome: Outcome
+    T: float
+    objective: float
+    slope: float
 
 
-def _step(point: _Point, radius: float, accepted: bool) -> tuple[TimeStep, Sequence[Iteration]]:
-    row = TimeStep(
-        final_time=point.T,
-        objective=point.objective,
-        slope=float(point.slope),
-        radius=radius,
-        accepted=bool(accepted),
-        iterations=point.outcome.iterations,
-    )
-    return row, point.outcome.history
+@dataclasses.dataclass(eq=False)
+class _Search:
+    """Horizons tried so far, and the iterations of those that were taken."""
+
+    model: Model
+    posed: Posed | None
+    options: Options
+    time_weight: float
+    bounds: tuple[float, float]
+    radius: float = 0.0
+    steps: list[TimeStep] = dataclasses.field(default_factory=list)
+    history: list[Iteration] = dataclasses.field(default_factory=list)
+
+    def planned(self, nominal: Outcome) -> _Point:
+        """The first horizon that can be planned for; too short a one is the usual reason not to."""
+        T = float(np.clip(self.model.times[-1] - self.model.times[0], *self.bounds))
+        self.radius = _FIRST_RADIUS * T
+        while True:
+            point = self._at(T, nominal.x, nominal.u)
+            self._add(point, True)
+            ended = point.outcome.status.ok or point.outcome.status is Status.STOPPED
+            if ended or self.bounds[1] <= T or len(self.steps) > _PLANS:
+                return point
+            T = min(_LONGER * T, self.bounds[1])
+
+    def settled(self, best: _Point) -> tuple[_Point, bool]:
+        """The best horizon from one that was planned for, and whether it is where it should be."""
+        # Effort falls with the third power of the horizon where the way is long.
+        curvature = 12.0 * max(best.objective - self.time_weight * best.T, 0.0) / best.T**2
+        while len(self.steps) <= _PLANS:
+            if abs(best.slope) <= _TRANSVERSALITY * best.objective / best.T:
+                return best, True
+            wish = -best.slope / curvature if curvature > 0.0 else -np.sign(best.slope) * np.inf
+            step = np.clip(wish, -self.radius, self.radius)
+            T = float(np.clip(best.T + step, *self.bounds))
+            if abs(T - best.T) <= _SHORTEST * best.T:
+                return best, T in self.bounds or abs(wish) <= self.radius
+            new = self._at(T, best.outcome.x, best.outcome.u * (best.T / T))
+            noise = _NOISE * abs(best.objective)
+            better = new.objective < best.objective - noise or (
+                new.objective < best.objective + noise and abs(new.slope) < abs(best.slope)
+            )
+            self._add(new, better)
+            if new.outcome.status is Status.STOPPED:
+                stopped = dataclasses.replace(best.outcome, status=Status.STOPPED)
+                return best._replace(outcome=stopped), False
+            if np.isfinite(new.slope):
+                curvature = (new.slope - best.slope) / (new.T - best.T)
+            self.radius = _SHRINK * abs(new.T - best.T)
+            if better:
+                self.radius = min(_GROW * self.steps[-1].radius, _LARGEST_RADIUS * new.T)
+                best = new
+        return best, False
+
+    def _at(self, T: float, x: Array, u: Array) -> _Point:
+        """The plan at a horizon of T seconds, a dilation of the time grid."""
+        weight, begin = self.options.variance_weight, self.model.times[0]
+        times = begin + (self.model.times - begin) * (T / (self.model.times[-1] - begin))
+        model = dataclasses.replace(self.model, times=times, dt=np.diff(times))
+        outcome = attempt(Task(model, self.posed, x, model.admissible(u)), self.options)
+        if not outcome.status.ok:
+            return _Point(model, outcome, T, np.inf, np.nan)
+        at = first_order(model, outcome.x, outcome.u, weight)
+        slope = time_slope(model, at, outcome.adjoint, weight) + self.time_weight
+        return _Point(model, outcome, T, outcome.objective + self.time_weight * T, float(slope))
+
+    def _add(self, point: _Point, accepted: bool) -> None:
+        iterations = point.outcome.iterations
+        row = (point.T, point.objective, point.slope, self.radius, bool(accepted), iterations)
+        self.steps.append(TimeStep(*row))
+        if accepted:
+            self.history += point.outcome.history

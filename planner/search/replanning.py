@@ -11,23 +11,30 @@ the multipliers. A few steps of :mod:`slipcar.planner.newton.loop` remain to be 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.posing import Posed, pose
-from slipcar.planner.newton.running import Steered, advance, solve_noise
+from slipcar.planner.newton.running import advance
 from slipcar.planner.problem.integrators import change
-from slipcar.planner.problem.model import Model
+from slipcar.planner.problem.model import Model, model_of
+from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.search.steering import Request
+from slipcar.planner.search.tasks import in_threads
 from slipcar.planner.status import Status
 
 Array = np.ndarray
+
+#: Plans of P episodes, K intervals before the end: x (P, K + 1, n), u (P, K, m), gains
+#: (P, K, m, n), eta (P, K, p), adjoint (P, K, n), terminal (P, q), A (P, K, n, n), B (P, K, n, m),
+#: as in :class:`slipcar.planner.newton.running.Steered`.
+Plans = dict[str, Array]
+FIELDS = ("x", "u", "gains", "eta", "adjoint", "terminal", "A", "B")
 
 #: Largest difference between a replan's mean and the path of its controls, per unit of the state.
 CONSISTENCY = 1e-2
@@ -36,199 +43,82 @@ _USABLE = (Status.CONVERGED, Status.MAX_ITERATIONS)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Tails:
-    """Plans of P episodes from a node on, K intervals before the end; never written to.
-
-    Attributes:
-        x: means, (P, K + 1, n).
-        u: controls, (P, K, m).
-        gains: (P, K, m, n).
-        eta: what the rows' variances are charged, (P, K, p).
-        adjoint: (P, K, n).
-        terminal: (P, q).
-        A: ∂x⁺/∂x along the plan, (P, K, n, n).
-        B: ∂x⁺/∂u, (P, K, n, m).
-    """
-
-    x: Array
-    u: Array
-    gains: Array
-    eta: Array
-    adjoint: Array
-    terminal: Array
-    A: Array
-    B: Array
-
-    @classmethod
-    def of(cls, plan: Steered) -> Tails:
-        """One plan, P = 1."""
-        return cls(**{name: getattr(plan, name)[None] for name in FIELDS})
-
-    def __len__(self) -> int:
-        return len(self.x)
-
-    def later(self, intervals: int) -> Tails:
-        """The same plans so many intervals later: a view."""
-        if intervals == 0:
-            return self
-        return self._each(lambda name, a: a if name == "terminal" else a[:, intervals:])
-
-    def take(self, rows: Any) -> Tails:
-        """Those of some episodes, (P',)."""
-        return self._each(lambda name, a: a[rows])
-
-    def repeat(self, count: int) -> Tails:
-        """The one plan for so many episodes: a view."""
-        return self._each(lambda name, a: np.broadcast_to(a, (count, *a.shape[1:])))
-
-    def choose(self, here: Array, other: Tails) -> Tails:
-        """These plans where `here` (P,), the others elsewhere."""
-        if here.all():
-            return self
-
-        def chosen(name: str, a: Array) -> Array:
-            mask = here.reshape(-1, *[1] * (a.ndim - 1))
-            return np.where(mask, a, getattr(other, name))
-
-        return self._each(chosen)
-
-    @classmethod
-    def join(cls, parts: list[tuple[Array, Tails]], count: int) -> Tails:
-        """Episodes from several places: rows (P_i,) of each part, together 0..count − 1."""
-        if len(parts) == 1:
-            rows, tails = parts[0]
-            return tails if np.array_equal(rows, np.arange(count)) else tails.take(np.argsort(rows))
-        joined = {}
-        for name in FIELDS:
-            shape = getattr(parts[0][1], name).shape[1:]
-            joined[name] = np.empty((count, *shape))
-            for rows, tails in parts:
-                joined[name][rows] = getattr(tails, name)
-        return cls(**joined)
-
-    def law(self, x: Array) -> Array:
-        """ū + K (x − μ) at the first node, for states (P, n): (P, m)."""
-        # A sum rather than a matrix product: the same bits for any number of episodes.
-        error = x - self.x[:, 0]
-        return self.u[:, 0] + (self.gains[:, 0] * error[:, None, :]).sum(axis=-1)
-
-    def steered_from(self, x: Array) -> tuple[Array, Array]:
-        """Where the plans' feedback leads from states x (P, n), to first order.
-
-        Returns:
-            States (P, K + 1, n) and controls (P, K, m).
-        """
-        states, controls = np.array(self.x), np.array(self.u)
-        closed = self.A + self.B @ self.gains
-        errors = np.empty_like(controls, shape=(*controls.shape[:2], x.shape[1]))
-        error = x - states[:, 0]
-        for k in range(controls.shape[1]):
-            errors[:, k] = error
-            # A sum rather than a matrix product: the same bits for any number of episodes.
-            error = np.add.reduce(closed[:, k] * error[:, None, :], axis=-1)
-        states[:, :-1] += errors
-        states[:, -1] += error
-        states[:, 0] = x
-        controls += np.add.reduce(self.gains * errors[:, :, None, :], axis=-1)
-        return states, controls
-
-    def _each(self, f: Callable[[str, Array], Array]) -> Tails:
-        return Tails(**{name: f(name, getattr(self, name)) for name in FIELDS})
-
-
-FIELDS = tuple(field.name for field in dataclasses.fields(Tails))
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class Replanner:
-    """Makes new plans from observed states.
+    """Makes new plans from observed states; options as in `RecedingHorizon`."""
 
-    Attributes:
-        posed: the problem over the whole horizon.
-        stakes: what is charged.
-        iterations: steps of the iteration, at most.
-        tolerance: of the iteration.
-        workers: threads.
-    """
-
-    posed: Posed
+    problem: Problem
     stakes: Stakes
     iterations: int
     tolerance: float
     workers: int
+    compiled: bool | None
 
-    @property
-    def model(self) -> Model:
-        """Of the whole horizon."""
-        return self.posed.model
+    @functools.cached_property
+    def posed(self) -> Posed:
+        """The problem, with compiled kernels where they can be had."""
+        model = model_of(self.problem)
+        return pose(model, constraints=self.stakes.priced, compiled=self.compiled)
 
-    def replan(self, tails: Tails, x: Array, interval: int) -> tuple[Tails, Array]:
-        """New plans for the intervals from `interval` on, from states x (P, n).
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions do not travel to other processes; they are found again there.
+        return {name: value for name, value in vars(self).items() if name != "posed"}
 
-        Args:
-            tails: the plans up to now, of that horizon.
-            x: observed states, (P, n).
-            interval: which one begins now.
+    def replan(self, plans: Plans, x: Array, interval: int) -> Array:
+        """Renew plans from `interval` on, in place, from observed states x (P, n).
 
         Returns:
-            Plans, and which of them can be used, (P,): finite, consistent with their own
-            controls, and not where the iteration gave up.
+            Which of them can be used, (P,): finite, consistent with their own controls, and not
+            where the iteration gave up.
         """
-        model, P = self._remaining(interval), len(x)
-        states, controls = tails.steered_from(x)
-        np.clip(controls, model.lower, model.upper, out=controls)
-        batch = {name: np.array(getattr(tails, name)) for name in FIELDS if name not in ("x", "u")}
-        batch |= {"x": states, "u": controls}
+        whole, P = self.posed.model, len(x)
+        times, known = whole.times[interval:], np.zeros_like(whole.start_covariance)
+        model = dataclasses.replace(whole, times=times, dt=np.diff(times), start_covariance=known)
+        _steer_from(plans, x)
+        np.clip(plans["u"], model.lower, model.upper, out=plans["u"])
         posed = self.posed.of(model)
         usable = np.zeros(P, dtype=bool)
 
         def part(rows: slice) -> None:
-            some = {name: array[rows] for name, array in batch.items()}
+            some = {name: array[rows] for name, array in plans.items()}
             endings = advance(
                 posed, self.stakes, some, tolerance=self.tolerance, max_iterations=self.iterations
             )
             usable[rows] = [status in _USABLE for status in endings]
 
         workers = min(self.workers or os.cpu_count() or 1, P)
-        if workers <= 1:
-            part(slice(None))
-        else:
-            edges = np.linspace(0, P, min(P, 4 * workers) + 1).astype(int).tolist()
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(part, map(slice, edges[:-1], edges[1:])))
-        new = Tails(**batch)
-        return new, usable & _sound(model, new)
+        edges = np.linspace(0, P, (min(P, 4 * workers) if workers > 1 else 1) + 1).astype(int)
+        in_threads(part, list(map(slice, edges[:-1], edges[1:])), workers)
+        return usable & _sound(model, plans)
 
-    def first(self, x: Array, u: Array, max_iterations: int) -> Steered:
-        """The plan of the whole horizon from states x (N, n) and controls u (K, m).
 
-        Raises:
-            ValueError: if the problem's functions are not finite along them.
-        """
-        return solve_noise(
-            self.posed, self.stakes, x, u, tolerance=self.tolerance, max_iterations=max_iterations
-        )
+def applied(gains: Array, error: Array) -> Array:
+    """K e, (..., m), for gains (..., m, n) and errors (..., n)."""
+    # A sum rather than a matrix product: the same bits for any number of episodes.
+    return np.add.reduce(gains * error[..., None, :], axis=-1)
 
-    def _remaining(self, interval: int) -> Model:
-        """The problem over the intervals that are left, from a state that is observed."""
-        model = self.model
-        times = model.times[interval:]
-        known = np.zeros_like(model.start_covariance)
-        return dataclasses.replace(model, times=times, dt=np.diff(times), start_covariance=known)
+
+def _steer_from(plans: Plans, x: Array) -> None:
+    """Move means and controls to where the plans' feedback leads from x (P, n), to first order."""
+    closed = plans["A"] + plans["B"] @ plans["gains"]
+    errors = np.empty_like(plans["x"])
+    errors[:, 0] = x - plans["x"][:, 0]
+    for k in range(closed.shape[1]):
+        errors[:, k + 1] = applied(closed[:, k], errors[:, k])
+    plans["u"] += applied(plans["gains"], errors[:, :-1])
+    plans["x"] += errors
+    plans["x"][:, 0] = x
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _sound(model: Model, plans: Tails) -> Array:
+def _sound(model: Model, plans: Plans) -> Array:
     """Whether plans are finite and their means follow their controls, (P,)."""
-    axes = {name: tuple(range(1, getattr(plans, name).ndim)) for name in FIELDS}
     # A sum is finite only if every entry is.
-    total = sum(getattr(plans, name).sum(axis=axes[name]) for name in FIELDS)
-    P, K = plans.u.shape[:2]
-    t, dt = np.broadcast_to(model.times[:-1], (P, K)), np.broadcast_to(model.dt, (P, K))
-    before, after = plans.x[:, :-1], plans.x[:, 1:]
-    moved = change(model.integrator, model.drift, t, dt, before, plans.u)
-    gap = np.abs(before + moved - after).max(axis=(1, 2))
-    return np.isfinite(total) & (gap <= CONSISTENCY * (1.0 + np.abs(plans.x).max(axis=(1, 2))))
+    total = sum(array.sum(axis=tuple(range(1, array.ndim))) for array in plans.values())
+    x, u = plans["x"], plans["u"]
+    t, dt = np.broadcast_to(model.times[:-1], u.shape[:2]), np.broadcast_to(model.dt, u.shape[:2])
+    moved = change(model.integrator, model.drift, t, dt, x[:, :-1], u)
+    gap = np.abs(x[:, :-1] + moved - x[:, 1:]).max(axis=(1, 2))
+    return np.isfinite(total) & (gap <= CONSISTENCY * (1.0 + np.abs(x).max(axis=(1, 2))))
 
 
 def stakes_of(model: Model, risk_price: float, saturation: float) -> Stakes:
@@ -238,8 +128,8 @@ def stakes_of(model: Model, risk_price: float, saturation: float) -> Stakes:
             f"risk_price={risk_price:g} needs a problem with constraint(t, x) -> (..., p), "
             f"violated where > 0, which {type(model.problem).__name__} has not"
         )
-    stakes = Request(feedback=True).stakes(model, 0.0).at_price(risk_price)
-    return dataclasses.replace(stakes, saturation=saturation)
+    stakes = Request(feedback=True).stakes(model, 0.0)
+    return dataclasses.replace(stakes, price=risk_price, saturation=saturation)
 
 
 def handover_of(model: Model, stakes: Stakes, given: Any) -> int:
@@ -257,16 +147,3 @@ def handover_of(model: Model, stakes: Stakes, given: Any) -> int:
     if not whole or not least <= given <= K:
         raise ValueError(f"handover must be None or an integer in [{least}, {K}], not {given!r}")
     return int(given)
-
-
-def replanner(
-    model: Model,
-    stakes: Stakes,
-    iterations: int,
-    tolerance: float,
-    workers: int,
-    compiled: bool | None,
-) -> Replanner:
-    """With compiled kernels where they can be had."""
-    posed = pose(model, constraints=stakes.priced, compiled=compiled)
-    return Replanner(posed, stakes, iterations, tolerance, workers)

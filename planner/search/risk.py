@@ -21,46 +21,31 @@ CONFIDENCE = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class PricedRate:
-    """One price tried on the way.
+    """One price tried on the way."""
 
-    Attributes:
-        price: ν, cost per unit of probability, ≥ 0.
-        predicted: Σ Φ(h/s) of the plan at that price, at most 1; None if the planner found none.
-        rate: share of the paths used for the search that violate; None if there was no plan.
-    """
-
-    price: float
+    price: float  #: ν, cost per unit of probability, ≥ 0
+    #: Σ Φ(h/s) of the plan at that price, at most 1; None if the planner found none
     predicted: float | None
+    #: share of the paths used for the search that violate; None if there was no plan
     rate: float | None
 
 
 @dataclasses.dataclass(frozen=True)
 class Risk:
-    """Three answers to how often a path of the plan breaks a constraint at some node.
+    """Three answers to how often a path of the plan breaks a constraint at some node."""
 
-    Attributes:
-        requested: δ, the probability not to be exceeded.
-        predicted: Σ_{k,i} Φ(h_{k,i} / s_{k,i}), at most 1: h the constraint at the mean, s its
-            standard deviation to first order, Φ the normal distribution function. Boole's bound,
-            so for exactly Gaussian states at least the true probability.
-        verified: rate over `episodes` paths that the search for the price never saw.
-        interval: Wilson 95 % interval of `verified`.
-        episodes: how many fresh paths.
-        price: ν of the plan, cost per unit of probability.
-        reached: whether a price was found that keeps δ; if not, the plan is that of least risk.
-        tried: the prices tried, in order.
-        simulation_time: seconds spent on Monte Carlo, search and verification together.
-    """
-
-    requested: float
+    requested: float  #: δ, the probability not to be exceeded
+    #: Σ_{k,i} Φ(h_{k,i} / s_{k,i}), at most 1: h the constraint at the mean, s its standard
+    #: deviation to first order, Φ the normal distribution function. Boole's bound, so for exactly
+    #: Gaussian states at least the true probability.
     predicted: float
-    verified: float
-    interval: tuple[float, float]
-    episodes: int
-    price: float
-    reached: bool
-    tried: tuple[PricedRate, ...]
-    simulation_time: float
+    verified: float  #: rate over `episodes` paths that the search for the price never saw
+    interval: tuple[float, float]  #: Wilson 95 % interval of `verified`
+    episodes: int  #: how many fresh paths
+    price: float  #: ν of the plan, cost per unit of probability
+    reached: bool  #: whether a price was found that keeps δ; if not, the plan is that of least risk
+    tried: tuple[PricedRate, ...]  #: the prices tried, in order
+    simulation_time: float  #: seconds spent on Monte Carlo, search and verification together
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -72,17 +57,7 @@ class Risk:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; :meth:`from_dict` gives back an equal object."""
-        return {
-            "requested": float(self.requested),
-            "predicted": float(self.predicted),
-            "verified": float(self.verified),
-            "interval": [float(end) for end in self.interval],
-            "episodes": int(self.episodes),
-            "price": float(self.price),
-            "reached": bool(self.reached),
-            "tried": [dataclasses.asdict(row) for row in self.tried],
-            "simulation_time": float(self.simulation_time),
-        }
+        return {**dataclasses.asdict(self), "reached": bool(self.reached)}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Risk:

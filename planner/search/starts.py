@@ -21,7 +21,8 @@ from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model, checked_trajectory
 from slipcar.planner.records import Alternative
-from slipcar.planner.search.tasks import Task, solve_tasks
+from slipcar.planner.search.attempt import Task, attempt
+from slipcar.planner.search.tasks import naming
 
 Array = np.ndarray
 
@@ -32,97 +33,58 @@ _SAME = 1e-3
 _BUMP = 0.5
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Guess:
-    """Where to start.
+def initial_guesses(model: Model, count: int, posed: Posed | None = None) -> list[Task]:
+    """Up to `count` ≥ 1 guesses, the most promising first; the problem's own is the first.
 
-    Attributes:
-        label: what it is, for people.
-        states: (N, n).
-        controls: (N−1, m).
-        free_first: whether to plan without penalties first.
-    """
-
-    label: str
-    states: Array
-    controls: Array
-    free_first: bool = False
-
-
-def initial_guesses(model: Model, count: int) -> list[Guess]:
-    """Up to `count` guesses, the most promising first; the problem's own is the first.
-
-    Where there are penalties it is there twice, without them first and as it is.
-
-    Args:
-        model: the completed problem.
-        count: at least 1. Fewer come back only if the problem offers fewer. An optional member
-            `guesses(count)` of the problem gives (label, states (N, n), controls (N−1, m)), the
-            most promising first.
-
-    Returns:
-        Guesses that start at `start`, with controls within bounds; the same call gives the same.
+    Where there are penalties it is there twice, without them first and as it is. Fewer come back
+    only if the problem offers fewer: an optional member `guesses(count)` of the problem gives
+    (label, states (N, n), controls (N−1, m)), the most promising first. All begin at `start`, with
+    controls within bounds; the same call gives the same.
 
     Raises:
         ValueError: if what `problem.guesses` gives is wrong.
     """
     x, u = model.guess()
-    found = [Guess("own", x, u, free_first=True)]
+    guesses = [Task(model, posed, x, u, free_first=True, label="own")]
     if model.weight.any():
-        found.append(Guess("own, penalties in", x, u))
+        guesses.append(Task(model, posed, x, u, label="own, penalties in"))
         count += 1  # the own one counts once, though it is tried both ways
     for label, states, controls in _others(model, x, u, int(count)):
-        if len(found) >= count:
+        if len(guesses) >= count:
             break
-        guess = Guess(label, *checked_trajectory(model, states, controls))
-        if not np.array_equal(guess.states, x):  # the own one again
-            found.append(guess)
-    return found[:count]
+        guess = checked_trajectory(model, states, controls)
+        if not np.array_equal(guess[0], x):  # the own one again
+            guesses.append(Task(model, posed, *guess, label=label))
+    return guesses[:count]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Starts:
-    """What several guesses led to.
+def multistart(
+    model: Model, posed: Posed | None, options: Options, count: int
+) -> tuple[list[tuple[Array, Outcome]], tuple[Alternative, ...]]:
+    """Plan from several guesses, one after the other: threads would not pay for a handful.
 
-    Attributes:
-        different: outcomes that are not the same answer, each with the states (N, n) of the guess
-            that led there, the best first.
-        alternatives: all that was tried, the best first; the same answers are marked.
+    Returns:
+        Outcomes that are not the same answer, each with the states (N, n) of the guess that led
+        there, the best first; and what became of every guess, the same answers marked.
     """
-
-    different: tuple[tuple[Array, Outcome], ...]
-    alternatives: tuple[Alternative, ...]
-
-
-def multistart(model: Model, posed: Posed | None, options: Options, count: int) -> Starts:
-    """Plan from several guesses, all at once where that is possible."""
-    guesses = initial_guesses(model, count)
-    tasks = [Task(model, posed, g.states, g.controls, g.free_first) for g in guesses]
-    # One thread: several would not pay for a handful of problems.
-    outcomes = solve_tasks(tasks, options, workers=1, label="guess {}")
-    order = sorted(range(len(guesses)), key=lambda i: _rank(outcomes[i]))
-    classify = getattr(model.problem, "homotopy_class", None)
+    outcomes: list[tuple[Task, Outcome]] = []
+    for i, task in enumerate(initial_guesses(model, count, posed)):
+        with naming(f"guess {i}"):
+            outcomes.append((task, attempt(task, options)))
+    outcomes.sort(key=lambda pair: _rank(pair[1]))
+    classify = getattr(model.problem, "homotopy_class", None) or (lambda x: None)
     rows: list[Alternative] = []
-    different: list[int] = []  # of the answers above, the first of its kind
-    for i in order:
-        outcome = outcomes[i]
-        row = Alternative(
-            label=guesses[i].label,
-            status=outcome.status,
-            cost=outcome.objective,
-            homotopy=None if classify is None else classify(outcome.x),
-            iterations=outcome.iterations,
-        )
-        twin = next((j for j in different if _same(model, rows, order, outcomes, j, row, i)), None)
-        if twin is None:
-            different.append(i)
+    different: list[tuple[Alternative, Array, Outcome]] = []
+    for task, new in outcomes:
+        kind = classify(new.x)
+        row = Alternative(task.label, new.status, new.objective, kind, new.iterations)
+        twins = (known for known, _, other in different if _same(model, known, other, row, new))
+        if (twin := next(twins, None)) is None:
+            different.append((row, task.x, new))
         else:
-            row = dataclasses.replace(row, same_as=guesses[twin].label)
+            row = dataclasses.replace(row, same_as=twin.label)
         rows.append(row)
-    return Starts(
-        different=tuple((guesses[i].states, outcomes[i]) for i in different),
-        alternatives=tuple(rows),
-    )
+    return [(states, outcome) for _, states, outcome in different], tuple(rows)
 
 
 def _others(model: Model, x: Array, u: Array, count: int) -> Iterator[tuple[str, Array, Array]]:
@@ -162,30 +124,21 @@ def _finite_along(model: Model, x: Array, u: Array) -> bool:
     return all(bool(np.isfinite(value).all()) for value in values)
 
 
-def _rank(found: Outcome) -> tuple[bool, float, float]:
+def _rank(outcome: Outcome) -> tuple[bool, float, float]:
     """Converged ones first, by objective; the others by what they miss, then by objective."""
-    worth = found.objective if math.isfinite(found.objective) else math.inf
-    if found.status.ok:
+    worth = outcome.objective if math.isfinite(outcome.objective) else math.inf
+    if outcome.status.ok:
         return (False, 0.0, worth)
-    missed = found.history[-1].terminal_residual if len(found.history) else math.inf
+    missed = outcome.history[-1].terminal_residual if len(outcome.history) else math.inf
     return (True, missed if math.isfinite(missed) else math.inf, worth)
 
 
-def _same(
-    model: Model,
-    rows: list[Alternative],
-    order: list[int],
-    outcomes: list[Outcome],
-    j: int,
-    row: Alternative,
-    i: int,
-) -> bool:
-    """Whether guess i, with this row, led to the answer of guess j."""
-    other = rows[order.index(j)]
-    if other.status is not row.status or other.homotopy != row.homotopy:
+def _same(model: Model, known: Alternative, best: Outcome, row: Alternative, new: Outcome) -> bool:
+    """Whether a new outcome, with its row, is the answer that is known."""
+    if known.status is not row.status or known.homotopy != row.homotopy:
         return False
     if row.homotopy is not None:
-        return abs(other.cost - row.cost) <= _SAME * max(abs(other.cost), abs(row.cost))
+        return abs(known.cost - row.cost) <= _SAME * max(abs(known.cost), abs(row.cost))
     dt = model.dt[:, None]
-    apart = float(np.sum(dt * (outcomes[i].u - outcomes[j].u) ** 2))
-    return apart <= _SAME**2 * float(np.sum(dt * outcomes[j].u ** 2))
+    apart = float(np.sum(dt * (new.u - best.u) ** 2))
+    return apart <= _SAME**2 * float(np.sum(dt * best.u**2))

@@ -2,9 +2,9 @@
 
     minimise  E[ Σ dt (uᵀRu + H + Σ w max(0, c)²) + gᵀWg ] + w ∫ tr Σ dt,   P(constraint) ≤ δ
 
-for Gaussian states (:mod:`slipcar.planner.newton.loop`). The chance constraint is priced: ν times Boole's
-bound joins the cost, which allocates the risk over nodes and rows, and ν is searched for until
-simulated paths keep δ (:mod:`.price_search`, :mod:`.monte_carlo`).
+for Gaussian states (:mod:`slipcar.planner.newton.loop`). The chance constraint is priced: ν times
+Boole's bound joins the cost, which allocates the risk over nodes and rows, and ν is searched for
+until simulated paths keep δ (:mod:`.price_search`, :mod:`slipcar.planner.moments.monte_carlo`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ from slipcar.planner.moments.gains import wrap
 from slipcar.planner.moments.monte_carlo import violations
 from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.running import Steered
-from slipcar.planner.options import Options, check_count, check_number
+from slipcar.planner.options import Options, check_count, check_flag, check_number
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.problem.control_set import project_controls
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import ExpectedCost
 from slipcar.planner.search.field import Field
-from slipcar.planner.search.price_search import PriceSearch, search_price
+from slipcar.planner.search.price_search import search_price
 from slipcar.planner.search.risk import PricedRate, Risk, check_risk, wilson_interval
 from slipcar.planner.status import Status
 
@@ -58,9 +57,9 @@ class Request:
             must not exceed it. The constraint is priced and the price searched for by Monte Carlo
             on common random numbers; `Plan.risk` holds what was predicted and what fresh paths
             say. Where no price leads there: status RISK_UNREACHABLE, with the plan of least risk.
-        price: ν ≥ 0 (`risk_price` of `plan`): add ν Σ P(violation) over nodes and constraints to
-            the expected cost (Boole's bound; optimal risk allocation). No Monte Carlo:
-            milliseconds.
+        risk_price: ν ≥ 0: add ν Σ P(violation) over nodes and constraints to the expected cost
+            (Boole's bound; optimal risk allocation). No Monte Carlo: milliseconds.
+        risk_episodes: fresh paths that verify a risk, ≥ 100.
         feedback: plan u = ū + K (x − μ) with the gains that minimise the expected cost: effort
             of the corrections included, bounds kept at a standard deviation of them.
             `Feedback(plan)` plays it.
@@ -69,34 +68,32 @@ class Request:
         terminal_weight: W ≥ 0, a number or (q,): charge E gᵀWg instead of asking for g(μ) = 0.
             None: exact, or with `feedback` the problem's `terminal_weight`, if it has one; if not,
             exact for the mean, and the spread charged 100 tr Cov g.
-        episodes: fresh paths that verify a risk, ≥ 100 (`risk_episodes`).
 
     Raises:
         ValueError: for a value out of range, naming it.
     """
 
     risk: float | None = None
-    price: float | None = None
+    risk_price: float | None = None
+    risk_episodes: int = 100_000
     feedback: bool = False
     expected: bool = False
     terminal_weight: Any = None
-    episodes: int = 100_000
 
     def __post_init__(self) -> None:
         if self.risk is not None:
             check_risk(self.risk)
-            if self.price is not None:
+            if self.risk_price is not None:
                 raise ValueError(
                     "risk and risk_price exclude each other: risk=δ searches for the price"
                 )
-        if self.price is not None:
-            if isinstance(self.price, (bool, np.bool_)):
-                raise ValueError(f"risk_price must be a number >= 0, not {self.price!r}")
-            check_number("risk_price", self.price, zero_allowed=True)
-        check_count("risk_episodes", self.episodes, least=100)
-        for name in ("feedback", "expected"):
-            if getattr(self, name) not in (True, False):
-                raise ValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
+        if self.risk_price is not None:
+            if isinstance(self.risk_price, (bool, np.bool_)):
+                raise ValueError(f"risk_price must be a number >= 0, not {self.risk_price!r}")
+            check_number("risk_price", self.risk_price, zero_allowed=True)
+        check_count("risk_episodes", self.risk_episodes, least=100)
+        check_flag("feedback", self.feedback)
+        check_flag("expected", self.expected)
         if self.terminal_weight is not None:
             _numbers(self.terminal_weight)
             if not self.wanted:
@@ -108,66 +105,71 @@ class Request:
     @property
     def wanted(self) -> bool:
         """Whether anything is."""
-        return self.feedback or self.expected or self.risk is not None or self.price is not None
+        priced = self.risk is not None or self.risk_price is not None
+        return self.feedback or self.expected or priced
 
     def check(self, options: Options, model: Model) -> None:
         """Raise ValueError for what an expected cost cannot be combined with."""
-        if options.only_convex or options.method == "convex":
-            other = options.only_convex or "method='convex'"
-            raise ValueError(f"risk, feedback and expected cannot be combined with {other}")
+        if options.convex:
+            raise ValueError(
+                f"risk, feedback and expected cannot be combined with {options.convex}"
+            )
         if model.radius < np.inf:
             raise ValueError("risk, feedback and expected know no control_radius: use bounds")
-        priced = self.risk is not None or bool(self.price)
-        if priced and getattr(model.problem, "constraint", None) is None:
+        priced = self.risk is not None or bool(self.risk_price)
+        if priced and not model.has("constraint"):
             raise ValueError(
                 f"risk needs the problem's constraint(t, x) -> (..., p), violated where > 0; "
                 f"{type(model.problem).__name__} has none"
             )
 
-    def stakes(self, model: Model, w: float) -> Stakes:
+    def stakes(self, model: Model, variance_weight: float) -> Stakes:
         """What to charge, constraints at price zero.
 
         Raises:
             ValueError: for a terminal weight of wrong shape or sign.
         """
-        problem: Any = model.problem
         q = np.shape(model.terminal(model.start))[-1]
         given = self.terminal_weight
         if given is None and self.feedback:
-            given = getattr(problem, "terminal_weight", None)
-        spread = _SPREAD_WEIGHT if self.feedback else 0.0
+            given = getattr(model.problem, "terminal_weight", None)
+        weight = np.asarray(_SPREAD_WEIGHT if self.feedback else 0.0)
+        if given is not None:
+            weight = _numbers(given)
+        if weight.shape not in ((), (q,)) or not np.isfinite(weight).all() or (weight < 0.0).any():
+            raise ValueError(
+                f"terminal_weight must be a number or ({q},) numbers, finite and >= 0, "
+                f"not {given!r}"
+            )
         return Stakes(
             penalties=model.weight,
             constraints=model.constraint_count(),
             price=0.0,
-            terminal=np.full(q, spread) if given is None else _checked_terminal(given, q),
+            terminal=np.array(np.broadcast_to(weight, (q,))),
             soft=given is not None,
             feedback=self.feedback,
-            variance_weight=w,
+            variance_weight=variance_weight,
         )
+
+
+def _numbers(given: Any) -> Array:
+    try:
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"terminal_weight must be numbers >= 0, not {given!r}") from error
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Steering:
-    """What came of a request.
+    """What came of a request."""
 
-    Attributes:
-        plan: where the iteration ended.
-        status: how planning ended.
-        cost: what is expected of the plan.
-        risk: where one was asked for.
-        message: what is lacking, or how a search went.
-        origin: which of the plans of the mean it started from.
-        iterations: Newton steps in all.
-    """
-
-    plan: Steered
+    plan: Steered  #: where the iteration ended
     status: Status
     cost: ExpectedCost
     risk: Risk | None
     message: str
-    origin: int
-    iterations: int
+    origin: int  #: which of the plans of the mean it started from
+    iterations: int  #: Newton steps in all
 
 
 def steer(
@@ -175,121 +177,103 @@ def steer(
 ) -> Steering:
     """Go on from plans of the mean, the best first; which is taken is decided by expected cost."""
     stakes = request.stakes(model, options.variance_weight)
-    field = Field(model, options, stakes, [(c.x, c.u) for c in candidates])
+    field = Field(model, options, stakes, candidates)
     if request.risk is not None:
-        return _Calibration(request, model, field).run()
-    plan = field.solve(request.price or 0.0) or field.attempt
-    say = "" if plan.status.ok else "the iteration on the expected cost did not settle"
-    return Steering(plan, plan.status, field.cost(plan), None, say, field.origin(plan), field.steps)
+        return _Calibration(float(request.risk), request.risk_episodes, model, field).run()
+    plan = field.solve(request.risk_price or 0.0) or field.attempt
+    message = "" if plan.status.ok else "the iteration on the expected cost did not settle"
+    return _steering(field, plan, plan.status, message)
+
+
+def _steering(
+    field: Field, plan: Steered, status: Status, message: str, risk: Risk | None = None
+) -> Steering:
+    cost, origin = field.cost(plan), field.origin(plan)
+    return Steering(plan, status, cost, risk, message, origin, field.steps)
 
 
 def law(model: Model, plan: Steered) -> Any:
     """The law u = ū + K (x − μ) within bounds, as a function (t, x (..., n)) -> (..., m)."""
     angles = tuple(getattr(model.problem, "angles", ()))
     closed = bool(plan.gains.any())
-    starts = model.times[:-1]
 
     def control(t: Any, x: Array) -> Array:
-        k = int(np.argmin(np.abs(starts - t)))
+        k = int(np.argmin(np.abs(model.times[:-1] - t)))
         if not closed:
             return np.broadcast_to(plan.u[k], (*np.shape(x)[:-1], plan.u.shape[1]))
-        u = plan.u[k] + wrap(x - plan.x[k], angles) @ plan.gains[k].T
-        return project_controls(u, model.lower, model.upper, model.radius)
+        return model.admissible(plan.u[k] + wrap(x - plan.x[k], angles) @ plan.gains[k].T)
 
     return control
 
 
 class _Calibration:
-    """The search for the price at which a risk is kept, the plan at that price, and the proof.
+    """The search for the price at which a risk δ is kept, the plan at that price, and the proof."""
 
-    Args:
-        request: with a risk δ.
-        model: the problem.
-        field: candidates.
-    """
-
-    def __init__(self, request: Request, model: Model, field: Field) -> None:
-        self._request, self._model, self._field = request, model, field
-        delta = self._delta = float(request.risk or 0.0)
-        paths = self._paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
-        noise = np.sqrt(delta * (1.0 - delta) * (1.0 / paths + 1.0 / request.episodes))
-        self._countable = delta * paths >= _COUNTABLE
-        self._target = max(delta - _CAUTION * float(noise), 0.3 * delta)
-        if not self._countable:
-            self._target = delta
+    def __init__(self, delta: float, episodes: int, model: Model, field: Field) -> None:
+        self._delta, self._episodes, self._model, self._field = delta, episodes, model, field
+        self._paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
+        self._countable = delta * self._paths >= _COUNTABLE
+        noise = np.sqrt(delta * (1.0 - delta) * (1.0 / self._paths + 1.0 / episodes))
+        cautious = max(delta - _CAUTION * float(noise), 0.3 * delta)
+        self._target = cautious if self._countable else delta
         self._simulated = 0.0
         self._tried: list[PricedRate] = []
 
     def run(self) -> Steering:
         """Search."""
-        free = self._field.solve(0.0)
-        verified = None if free is None else self._safe_already(free)
-        if free is not None and verified is not None:
-            return self._answer(free, 0.0, verified, kept=True)
-        delta, target = self._delta, self._target
-        price = _FIRST * max(abs(self._field.attempt.effort), 1e-6) / delta
+        delta, target, field = self._delta, self._target, self._field
+        free = field.solve(0.0)
+        # Boole's bound says whether to look.
+        if free is not None and field.predicted_risk(free) <= _BOOLE * delta:
+            rate = self._measure(free)
+            self._tried.append(PricedRate(0.0, field.predicted_risk(free), rate))
+            if rate <= target and (verified := self._verified(free, 0)) <= delta:
+                return self._answer(free, 0.0, verified, True)
+        price = _FIRST * max(abs(field.attempt.effort), 1e-6) / delta
         for attempt in range(_VERIFICATIONS):
-            search = self._search(target, price)
-            plan = search.best
+            search = search_price(
+                field.solve,
+                self._measure,
+                target=target,
+                start=price,
+                largest=_DEAREST * price,
+                resolution=1.0 / self._paths if self._countable else 0.0,
+            )
+            for trial in search.tried:
+                predicted = trial.answer and field.predicted_risk(trial.answer)
+                self._tried.append(PricedRate(trial.price, predicted, trial.rate))
+            plan, price = search.best, search.price
             if plan is None:
-                last = self._field.attempt
+                last = field.attempt
                 say = f"no plan was found at any price of risk: the last ended {last.status}"
-                cost, status = self._field.cost(last), Status.SOLVER_FAILED
-                return Steering(last, status, cost, None, say, 0, self._field.steps)
-            verified = self._rate(plan, self._request.episodes, _VERIFICATION_SEED + attempt)
+                return _steering(field, last, Status.SOLVER_FAILED, say)
+            verified = self._verified(plan, attempt)
             if verified <= delta or not search.reached:
                 break
             # Fresh paths disagree with those of the search: ask for less.
-            target, price = target * 0.9 * delta / verified, search.price
-        kept = bool(search.reached and verified <= delta)
-        return self._answer(plan, search.price, verified, kept)
-
-    def _safe_already(self, free: Steered) -> float | None:
-        """The verified rate of the plan without a price, if it keeps the risk; else None."""
-        predicted = self._field.predicted_risk(free)
-        # Boole's bound says whether to look.
-        if predicted > _BOOLE * self._delta:
-            return None
-        rate = self._measure(free)
-        self._tried.append(PricedRate(0.0, predicted, rate))
-        if rate > self._target:
-            return None
-        verified = self._rate(free, self._request.episodes, _VERIFICATION_SEED)
-        return verified if verified <= self._delta else None
-
-    def _search(self, target: float, price: float) -> PriceSearch:
-        search = search_price(
-            lambda price, _: self._field.solve(price),
-            self._measure,
-            target=target,
-            first=price,
-            largest=_DEAREST * price,
-            resolution=1.0 / self._paths if self._countable else 0.0,
-        )
-        for trial in search.tried:
-            predicted = trial.answer and self._field.predicted_risk(trial.answer)
-            self._tried.append(PricedRate(trial.price, predicted, trial.rate))
-        return search
+            target *= 0.9 * delta / verified
+        return self._answer(plan, price, verified, search.reached and verified <= delta)
 
     def _measure(self, plan: Steered) -> float:
+        """The rate on the paths of the search; predicted where they are too few to tell."""
         if self._countable:
             return self._rate(plan, self._paths, _SEARCH_SEED)
         return self._field.predicted_risk(plan)
 
+    def _verified(self, plan: Steered, attempt: int) -> float:
+        return self._rate(plan, self._episodes, _VERIFICATION_SEED + attempt)
+
     def _rate(self, plan: Steered, episodes: int, seed: int) -> float:
-        began = time.perf_counter()
-        broken = violations(
-            self._model.problem, law(self._model, plan), episodes=episodes, seed=seed
-        )
+        began, driven = time.perf_counter(), law(self._model, plan)
+        broken = violations(self._model.problem, driven, episodes=episodes, seed=seed)
         self._simulated += time.perf_counter() - began
         return float(broken.mean())
 
     def _answer(self, plan: Steered, price: float, verified: float, kept: bool) -> Steering:
-        delta, episodes, field = self._delta, self._request.episodes, self._field
-        cost = field.cost(plan)
+        delta, episodes = self._delta, self._episodes
         risk = Risk(
             requested=delta,
-            predicted=cost.risk,
+            predicted=self._field.predicted_risk(plan),
             verified=verified,
             interval=wilson_interval(round(verified * episodes), episodes),
             episodes=episodes,
@@ -304,22 +288,4 @@ class _Calibration:
             say = f"P(violation) <= {delta:g} was not reached: the least found is {verified:.4g}"
         elif not self._countable:
             say = f"{self._paths:,} paths cannot tell a risk of {delta:g}: Boole's bound keeps it"
-        return Steering(plan, status, cost, risk, say, field.origin(plan), field.steps)
-
-
-def _numbers(given: Any) -> Array:
-    try:
-        return np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"terminal_weight must be numbers >= 0, not {given!r}") from error
-
-
-def _checked_terminal(given: Any, q: int) -> Array:
-    weight = _numbers(given)
-    if weight.ndim == 0:
-        weight = np.full(q, float(weight))
-    if weight.shape != (q,) or not np.isfinite(weight).all() or (weight < 0.0).any():
-        raise ValueError(
-            f"terminal_weight must be a number or ({q},) numbers, finite and >= 0, not {given!r}"
-        )
-    return weight
+        return _steering(self._field, plan, status, say, risk)

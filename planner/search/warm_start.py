@@ -26,12 +26,14 @@ Array = np.ndarray
 
 
 def given_guess(model: Model, guess: Any) -> tuple[Array, Array]:
-    """States (N, n) and controls (N−1, m) from a plan or a pair of arrays.
+    """States (N, n) and controls (N−1, m): the problem's own, from a plan, or a pair of arrays.
 
     Raises:
         ValueError: for anything else, a wrong shape, a non-finite entry, or a plan of other
             dimensions.
     """
+    if guess is None:
+        return model.guess()
     if hasattr(guess, "mean") and hasattr(guess, "controls") and hasattr(guess, "times"):
         return checked_trajectory(model, *_resampled(model, guess))
     if not isinstance(guess, (tuple, list)) or len(guess) != 2:
@@ -47,7 +49,7 @@ def _resampled(model: Model, plan: Any) -> tuple[Array, Array]:
             f"guess: a plan with {n} states and {m} controls does not fit a problem with "
             f"{model.state_dim} and {model.control_dim}"
         )
-    if len(old) == len(new) and np.array_equal(old, new):
+    if np.array_equal(old, new):
         return plan.mean, plan.controls
     slack = 1e-9 * (old[-1] - old[0])
     if new[0] < old[0] - slack or new[-1] > old[-1] + slack:
@@ -68,48 +70,27 @@ def run_guarded(
 ) -> tuple[Array, Outcome]:
     """The better outcome of a given guess and the problem's own, and the states it began with.
 
-    Args:
-        model: the problem.
-        options: of the iteration.
-        run: the iteration from states (N, n) and controls (N−1, m); `own=True` says that they
-            are the problem's own guess.
-        guess: where to start.
-        trusted: whether the problem's own guess may be left out if the given one obeys the
-            dynamics and the terminal condition at least as well and its outcome converges.
+    `run` iterates from states and controls, `own=True` saying that they are the problem's. If
+    `trusted`, its own guess is left out where the given one obeys the dynamics and the terminal
+    condition at least as well and its outcome converges.
     """
-    warm = run(*guess)
-    if warm.status is Status.STOPPED:
+
+    def off(x: Array, u: Array) -> float:
+        return inconsistency(linearize(model, x, u), options.terminal_tolerance)
+
+    warm, own = run(*guess), model.guess()
+    same = all(np.array_equal(a, b) for a, b in zip(guess, own, strict=True))
+    trusted = trusted and warm.status.ok
+    if warm.status is Status.STOPPED or same or (trusted and off(*guess) <= off(*own)):
         return guess[0], warm
-    own = model.guess()
-    if all(np.array_equal(a, b) for a, b in zip(guess, own, strict=True)):
-        return guess[0], warm
-    if trusted and warm.status.ok:
-        off = [
-            inconsistency(linearize(model, *start), options.terminal_tolerance)
-            for start in (guess, own)
-        ]
-        if off[0] <= off[1]:
-            return guess[0], warm
     cold = run(*own, own=True)
-    if _better(model, options, cold, warm):
-        say = f"the plan from the problem's own guess: the given one led to {_told(warm)}"
-        return own[0], cold.said(say)
-    say = f"the plan from the given guess: the problem's own led to {_told(cold)}"
-    return guess[0], warm.said(say)
-
-
-def _better(model: Model, options: Options, a: Outcome, b: Outcome) -> bool:
-    """Whether a is: converged, or lacking less, or cheaper by more than rounding errors."""
-    if a.status.ok != b.status.ok:
-        return a.status.ok
-    if not a.status.ok:
-        off = [
-            inconsistency(linearize(model, found.x, found.u), options.terminal_tolerance)
-            for found in (a, b)
-        ]
-        return off[0] < off[1]
-    return a.objective < b.objective - 1e-6 * (1.0 + abs(b.objective))
-
-
-def _told(outcome: Outcome) -> str:
-    return f"{outcome.status} at {outcome.objective:.6g}"
+    if cold.status.ok != warm.status.ok:
+        better = cold.status.ok
+    elif not cold.status.ok:
+        better = off(cold.x, cold.u) < off(warm.x, warm.u)
+    else:  # cheaper by more than rounding errors
+        better = cold.objective < warm.objective - 1e-6 * (1.0 + abs(warm.objective))
+    words = "the plan from {} guess: {} led to {o.status} at {o.objective:.6g}"
+    if better:
+        return own[0], cold.said(words.format("the problem's own", "the given one", o=warm))
+    return guess[0], warm.said(words.format("the given", "the problem's own", o=cold))

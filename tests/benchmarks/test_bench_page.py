@@ -118,26 +118,46 @@ def test_provenance_names_the_command_and_the_load(bench, monkeypatch):
     assert told["cpu"] in bench("report").machine(told)
 
 
-def test_cold_start_times_each_case_and_the_empty_cache_once(bench, monkeypatch):
+def test_cold_start_times_each_case_with_a_warm_cache_or_an_empty_one(bench, monkeypatch):
     cold = bench("cold")
     asked = []
 
-    def process(case, **environment):
-        asked.append((case, *environment))
+    def process(case, cache):
+        full = any(Path(cache).iterdir())
+        asked.append((case, cache, full))
+        (Path(cache) / "code.o").touch()
         if case == "fatrop":
             raise cold.subprocess.CalledProcessError(1, case, stderr="Trace\nno casadi here\n")
         return {"whole": 2.0, "import": 1.0, "first": 0.5, "second": 0.1}
 
     monkeypatch.setattr(cold, "_fresh_process", process)
     section = cold.section(rounds=3)
-    assert asked.count(("numba",)) == 4  # the first one fills the cache
-    assert asked.count(("numba", "NUMBA_CACHE_DIR")) == 1
-    assert asked.count(("fatrop",)) == 1
+    cases = [case for case, _, _ in asked]
+    assert cases.count("plan") == 8  # the first round is not counted
+    assert cases.count("fatrop") == 1
+    for name, (case, empty) in {**cold.CASES, **cold.KINDS}.items():
+        full = [f for asked_case, _, f in asked[2:] if asked_case == case]
+        if case != "plan":
+            assert set(full) == {not empty}, name
+    assert [f for case, _, f in asked if case == "plan"][2:] == [True, False] * 3
+    assert not any(Path(cache).exists() for _, cache, _ in asked)
     assert section.notes == ("skipped CasADi + fatrop: no casadi here",)
     runs = {row["fresh process"]: row["runs"] for row in section.tables["Import and first plan"]}
-    assert runs["slipcar, numba"] == 3
-    assert runs[cold.FIRST_EVER] == 1
-    assert "CasADi + fatrop" not in runs
+    assert set(runs) == set(cold.CASES) - {"CasADi + fatrop"}
+    assert set(runs.values()) == {3}
+    (kind, *_) = section.tables["A new kind of problem"]
+    assert (kind["kind"], kind["runs"]) == ("2 states", 3)
+    assert kind["compiling [s] (median)"] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("case", ["nothing", "plan", "receding", "numpy", "pendulums:1"])
+def test_a_fresh_process_tells_its_times(bench, tmp_path, case):
+    told = bench("cold")._fresh_process(case, str(tmp_path))
+    times = set() if case == "nothing" else {"import", "first", "second"}
+    assert set(told) == {"whole"} | times
+    assert all(seconds > 0.0 for seconds in told.values())
+    # What has planned has compiled, but for that which cannot.
+    assert bool(list(tmp_path.glob("*.o"))) is (case not in ("nothing", "numpy"))
 
 
 def test_every_part_belongs_to_one_page(bench):

@@ -47,11 +47,12 @@ def _plan(bench, makers, name):
 @pytest.mark.parametrize(
     "name",
     [
-        "slipcar, numba",
-        "slipcar, numba, fine",
-        "slipcar, numba, new scenario",
-        "slipcar, NumPy/SciPy",
-        "slipcar, NumPy/SciPy, fine",
+        "slipcar",
+        "slipcar, fine",
+        "slipcar, new scenario",
+        "slipcar, own class",
+        "slipcar, NumPy",
+        "slipcar, NumPy, fine",
         "slipcar, convex scheme",
         "slipcar, OSQP in place",
         "slipcar, cvxpy + Clarabel",
@@ -101,12 +102,57 @@ def test_crocoddyl_reaches_the_cost_but_for_its_penalty(bench, makers):
 
 
 def test_variance_weight_trades_cost_for_variance(bench, makers):
-    _, compiled, judged = _plan(bench, makers, "slipcar, numba, w = 1")
-    _, plain, _ = _plan(bench, makers, "slipcar, NumPy/SciPy, w = 1")
+    _, compiled, judged = _plan(bench, makers, "slipcar, w = 1")
+    _, plain, _ = _plan(bench, makers, "slipcar, NumPy, w = 1")
     _, convex, _ = _plan(bench, makers, "slipcar, convex scheme, w = 1")
     assert judged.cost > bench("planners").reference()[1]  # nothing is cheaper than the optimum
     np.testing.assert_allclose(compiled.controls, plain.controls, atol=1e-6)
     np.testing.assert_allclose(compiled.controls, convex.controls, atol=1e-2)
+
+
+def test_random_worlds_are_new_each_time_and_in_no_table_of_the_papers_case(
+    bench, makers, monkeypatch
+):
+    planners, many, turns = bench("planners"), bench("many"), bench("turns")
+    seeds, random = [], Scenario.random
+    monkeypatch.setattr(
+        Scenario,
+        "random",
+        lambda seed, *given, **options: seeds.append(seed) or random(seed, *given, **options),
+    )
+    one = makers["slipcar, random worlds"]()
+    batch = many.new_worlds(count=3)
+    seeds.clear()
+    answers = [contender.solve()[1] for contender in (one, one, batch, batch)]
+    assert len(set(seeds)) == len(seeds) == 8
+    assert all(answer.found for answer in answers)
+    assert bench("contenders").EXACT not in (one.solves, batch.solves)
+    timings = [turns.Timing(c, answers[0], np.array([0.1, 0.3])) for c in (one, batch)]
+    assert (
+        planners.rows(timings) == planners.ratios(timings) == planners.disagreements(timings) == []
+    )
+    told = {row["planner"]: row for row in planners.unmet_rows(timings)}
+    assert told[one.name]["95 %"] == pytest.approx(290.0)
+    assert told[batch.name]["ms (median)"] == pytest.approx(200.0 / 3.0)
+
+
+def test_a_users_own_class_is_the_scenario(bench):
+    scenario = Scenario.named("paper")
+    own, rng = bench("own_problems").OwnCar(scenario), np.random.default_rng(0)
+    t, x, u = np.zeros(6), rng.normal(size=(6, 5)), rng.normal(size=(6, 2))
+    np.testing.assert_allclose(own.drift(t, x, u), scenario.drift(t, x, u), atol=1e-15)
+    np.testing.assert_allclose(own.penalty(t, x), scenario.penalty(t, x), atol=1e-14)
+    np.testing.assert_array_equal(own.terminal(x), scenario.terminal(x))
+    covariance = [s @ s.swapaxes(-1, -2) for s in (own.diffusion(t, x), scenario.diffusion(t, x))]
+    np.testing.assert_allclose(*covariance, atol=1e-15)
+    assert not hasattr(own, "parameters")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_pendulums_are_planned_for(bench, count):
+    p = plan(bench("own_problems").Pendulums(count))
+    assert p.status.ok
+    assert p.mean.shape == (41, 2 * count)
 
 
 def test_start_states_are_the_own_one_and_others_within_reach(bench):

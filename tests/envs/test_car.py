@@ -112,7 +112,6 @@ def test_torch_gives_numpys_numbers(shape):
     pairs = [
         (car.drift(X, U), car.drift(x, u)),
         *zip(car.drift_jacobian(X, U), car.drift_jacobian(x, u), strict=True),
-        (car.slip_intensity(X, SLIP), car.slip_intensity(x, SLIP)),
         (car.diffusion(X, SLIP), car.diffusion(x, SLIP)),
         (car.diffusion_jacobian(X, SLIP), car.diffusion_jacobian(x, SLIP)),
     ]

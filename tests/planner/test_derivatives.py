@@ -169,7 +169,7 @@ def test_a_spline_is_differenced():
         def state_cost(self, t, x):
             return self.road(x[..., 0]) * x[..., 1]
 
-    own, (t, x, u) = Jacobians(Spline(), 3, 2), _points((6,))
+    own, (t, x, _) = Jacobians(Spline(), 3, 2), _points((6,))
     gradient, hessian = own.state_cost(t, x)
     y, dy, ddy = (Spline.road(x[:, 0], k) for k in range(3))
     np.testing.assert_allclose(gradient, np.stack([dy * x[:, 1], y, 0.0 * y], -1), atol=1e-8)
@@ -245,7 +245,7 @@ def test_central_differences_are_of_second_order(order):
 def test_a_constant_function_has_no_derivative():
     system = System()
     system.diffusion = lambda t, x: np.ones((*x.shape[:-1], 3, 2))
-    t, x, u = _points((4,))
+    t, x, _ = _points((4,))
     slope = Jacobians(system, 3, 2).state("diffusion", t, x)
     assert slope.shape == (4, 3, 2, 3)
     assert not slope.any()

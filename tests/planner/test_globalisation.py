@@ -189,7 +189,7 @@ def test_accelerated_steps_reach_the_same_optimum(paper):
 def test_a_negligible_multiplier_is_dropped():
     region = AdaptiveTrustRegion(free=0, multiplier=1.0)
     for _ in range(20):
-        assert region.judge(Step(0.1, 1.0, 1.0, 0.0, 1.0))
+        assert region.judge(Step(0.1, 1.0, 1.0, 1.0))
     assert region.multiplier == 0.0
 
 
@@ -197,5 +197,5 @@ def test_the_careful_schedule_judges_from_the_first_step():
     careful = AdaptiveTrustRegion().cautious(7.0)
     assert careful.multiplier == 7.0
     assert not careful.bold
-    assert not careful.judge(Step(0.1, 1.0, -1.0, 2.0, 1.0))
+    assert not careful.judge(Step(0.1, 1.0, -1.0, 1.0))
     assert careful.cautious(1.0) is None  # there is no third attempt

@@ -1,4 +1,4 @@
-"""The LQ problem of a step: recursion, machine code made of it, and banded system against dense KKT.
+"""The LQ problem of a step: recursion, its machine code, and bands against a dense KKT system.
 
 The recursion also tells whether the problem is convex: exactly if every pivot is positive.
 """

@@ -491,10 +491,11 @@ def _agree_with_functions(posed):
     x = model.start + rng.normal(size=(K, model.state_dim))
     u = rng.normal(size=(K, model.control_dim))
     got = posed.problem.values(model.times[:-1], model.dt[0], x, u, posed.numbers)
-    parts = [_step(model, x, u), model.diffusion(model.times[:-1], x).reshape(K, -1)]
+    none = np.zeros((K, model.control_dim + 1))  # these have neither ℓ nor H
+    parts = [_step(model, x, u), model.diffusion(model.times[:-1], x).reshape(K, -1), none[:, 1:]]
     if len(model.weight):
         parts.append(model.penalty(model.times[:-1], x))
-    parts.append(model.terminal(x))
+    parts += [none[:, :1], model.terminal(x)]
     _close(got, np.concatenate(parts, axis=1))
 
 
@@ -694,6 +695,11 @@ class Tries(Cart):
         return super().drift(t, x, u) * factor
 
 
+class Pushed(Cart):
+    def drift(self, t, x, u):
+        return super().drift(t, x, u) + 0.123
+
+
 class Random(Cart):
     rng = np.random.default_rng(0)
 
@@ -721,7 +727,9 @@ class Filtered(Cart):
 
 @pytest.mark.parametrize("kind", [ByType, ByInstance, Tries, Random, Counts, Repr, Filtered])
 def test_traces_that_tell_another_story_are_not_used(kind, rollout):
-    # Either the plan follows what the functions say, or it is refused.
+    # Either the plan follows what the functions say, or it is refused; also where the structure
+    # is known of an honest problem.
+    plan(Pushed(), variance_weight=0.0)
     problem = kind()
     try:
         p = plan(problem, variance_weight=0.0, tolerance=1e-10)
@@ -759,9 +767,7 @@ def test_with_its_derivative_it_is_taken_as_it_is():
             A[..., 0, 1], A[..., 1, 1] = 1.0, -3.0 * self.drag * x[..., 1] ** 2
             return A, np.broadcast_to([[0.0], [1.0]], (*x.shape, 1))
 
-    native, plain = (
-        plan(kind(), variance_weight=0.0, tolerance=1e-12) for kind in (Given, Cart)
-    )
+    native, plain = (plan(kind(), variance_weight=0.0, tolerance=1e-12) for kind in (Given, Cart))
     np.testing.assert_allclose(native.controls, plain.controls, atol=1e-6)
 
 

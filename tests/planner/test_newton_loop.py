@@ -477,11 +477,15 @@ def test_what_is_said_of_steps_is_what_they_are(paper, path, cost_of_controls):
     dt = model.dt
     before = model.guess()[1]
     for h in found.history:
-        assert h.effort == pytest.approx(np.einsum("k,ki,ij,kj", dt, h.controls, model.R, h.controls))
+        assert h.effort == pytest.approx(
+            np.einsum("k,ki,ij,kj", dt, h.controls, model.R, h.controls)
+        )
         c = np.maximum(paper.penalty(model.times[1:], h.mean[1:]), 0.0)
         assert h.penalty == pytest.approx(dt @ (c * c @ model.weight), rel=1e-9, abs=1e-12)
         if h.accepted:
-            assert h.step == pytest.approx(dt @ ((h.controls - before) ** 2).sum(axis=1), rel=1e-6, abs=1e-20)
+            assert h.step == pytest.approx(
+                dt @ ((h.controls - before) ** 2).sum(axis=1), rel=1e-6, abs=1e-20
+            )
             before = h.controls
     last = found.history[-1]
     S = np.einsum("k,kii", dt, found.covariance[1:])

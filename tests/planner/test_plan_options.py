@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import pickle
 import subprocess
 import sys
@@ -9,10 +10,11 @@ import threading
 
 import numpy as np
 import pytest
+import scipy.interpolate
 
 from slipcar.envs import Scenario, car
 from slipcar.planner import Status, plan, plan_batch
-from slipcar.planner.problem.recent import is_immutable
+from slipcar.planner.trace import machine_code
 
 GOAL = (2.2, 3.0, 0.0, 0.0, 0.0)
 ALONG = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
@@ -137,7 +139,6 @@ def _same_as_new(kind, change):
 
 
 def test_attributes_of_a_plain_subclass():
-    assert not is_immutable(Driven(start=np.zeros(5), goal=GOAL))
     _same_as_new(Driven, lambda problem, value: setattr(problem, "wind", value))
 
 
@@ -167,9 +168,46 @@ def test_a_number_that_is_not_named_among_the_parameters():
     assert [p.effort for p in plan_batch([still, blown, still])] == alone
 
 
-def test_a_scenario_is_looked_at_once(paper):
-    # Its methods read nothing but fields, which cannot change.
-    assert is_immutable(paper)
+def test_methods_that_are_replaced():
+    problem = Hill()
+    flat = plan(problem)
+    drift = problem.drift
+    problem.drift = lambda t, x, u: drift(t, x, u) - np.array([0.0, 0.5])
+    blown = plan(problem)
+    assert abs(blown.effort - flat.effort) > 0.1
+    del problem.drift
+    np.testing.assert_array_equal(plan(problem).controls, flat.controls)
+
+
+class Partial(Hill):
+    """Its functions are partials and callable objects, as those of a factory would be."""
+
+    def __init__(self, slope):
+        super().__init__()
+        self.slope = slope
+        self.drift = functools.partial(Partial.moved, self)
+        self.terminal = Partial.Goal(self.goal)
+
+    def moved(self, t, x, u):
+        return np.stack([x[..., 1], u[..., 0] - self.slope * x[..., 0]], axis=-1)
+
+    class Goal:
+        def __init__(self, goal):
+            self.goal = goal
+
+        def __call__(self, x):
+            return x - self.goal
+
+
+def test_partials_and_callable_objects():
+    problem = Partial(0.0)
+    plan(problem)
+    problem.slope, problem.terminal.goal = 2.0, np.array([0.5, 0.0])
+    changed = plan(problem, tolerance=1e-9)
+    np.testing.assert_allclose(changed.mean[-1], [0.5, 0.0], atol=1e-9)
+    fresh = Partial(2.0)
+    fresh.terminal.goal = np.array([0.5, 0.0])
+    np.testing.assert_array_equal(changed.controls, plan(fresh, tolerance=1e-9).controls)
 
 
 def test_a_drift_at_random_is_refused():
@@ -287,7 +325,6 @@ def test_errors_of_callbacks_come_through(paper, options):
         ({"compiled": True, "solver": "osqp"}, "compiled=True .* solver='osqp'"),
         ({"compiled": True, "terminal_tolerance": 1e-3}, "compiled=True .* terminal_tolerance"),
         ({"compiled": True, "shooting": True}, "shooting=True .* compiled=True"),
-        ({"compiled": True, "callback": print}, "compiled=True leaves no room for a callback"),
         ({"callback": 3}, "callback must be a function"),
         ({"solver": 3}, "solver must be a name or an object"),
         ({"solver": None}, "solver must be a name or an object"),
@@ -299,24 +336,58 @@ def test_conflicts_are_told(paper, options, message):
         plan(paper, **options)
 
 
-def test_what_cannot_be_traced_says_why():
+@pytest.mark.skipif(not machine_code.available(), reason="needs llvmlite")
+def test_compiled_or_not_the_plan_is_the_same(paper):
+    seen = []
+    default, native, plain = (
+        plan(paper, compiled=compiled, callback=seen.append, tolerance=1e-9)
+        for compiled in (None, True, False)
+    )
+    np.testing.assert_array_equal(default.controls, native.controls)
+    np.testing.assert_allclose(native.controls, plain.controls, atol=1e-9)
+    assert native.iterations == plain.iterations
+    assert len(seen) == 3 * plain.iterations
+
+
+class Tabled(Hill):
+    """With a spline of SciPy's, which cannot be traced."""
+
+    road = scipy.interpolate.CubicSpline([-9.0, 0.0, 1.0, 9.0], [0.0, 0.2, -0.1, 0.0])
+
+    def drift(self, t, x, u):
+        return np.stack([x[..., 1], u[..., 0] - self.road(x[..., 0])], axis=-1)
+
+
+@pytest.mark.skipif(not machine_code.available(), reason="needs llvmlite")
+def test_what_cannot_be_traced_says_why(rollout):
+    with pytest.raises(ValueError, match=r"functions of Tabled cannot be compiled: drift.*road"):
+        plan(Tabled(), compiled=True)
+    for compiled in (None, False):
+        p = plan(Tabled(), compiled=compiled, tolerance=1e-9)
+        assert p.status is Status.CONVERGED
+        assert "differentiated numerically, as they cannot be traced: drift" in p.message
+        np.testing.assert_allclose(p.mean, rollout(p.problem, p.controls), atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "convex"}])
+def test_a_branch_is_refused_with_its_line_and_what_to_write_instead(options):
     class Branching(Hill):
         def drift(self, t, x, u):
-            return np.where(x[..., :1] > 9.0, 0.0, super().drift(t, x, u))
+            if (x[..., 0] > 9.0).any():
+                return 0.0 * x
+            return super().drift(t, x, u)
 
-    pytest.importorskip("llvmlite")
-    assert plan(Branching()).status.ok
-    with pytest.raises(ValueError, match="cannot be compiled: a comparison"):
-        plan(Branching(), compiled=True)
+    with pytest.raises(ValueError, match=r"drift: a branch.*np\.where.*test_plan_options\.py:\d+"):
+        plan(Branching(), **options)
 
 
-def test_compiled_without_numba_says_what_to_install():
+def test_without_llvmlite_plans_are_made_by_numpy_and_it_is_said():
     code = """
 import sys
-sys.modules["numba"] = sys.modules["llvmlite"] = None
+sys.modules["llvmlite"] = None
 from slipcar.envs import Scenario
 from slipcar.planner import plan, plan_batch
-paper = Scenario.named("paper")
+paper = Scenario.named("open").replace(nodes=11)
 assert plan(paper).status.ok and plan_batch([paper])[0].status.ok
 for call in (lambda: plan(paper, compiled=True), lambda: plan_batch([paper], compiled=True)):
     try:
@@ -325,9 +396,8 @@ for call in (lambda: plan(paper, compiled=True), lambda: plan_batch([paper], com
         print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (
-        done.stdout.splitlines() == ['compiled=True needs numba: pip install "slipcar[fast]"'] * 2
-    )
+    assert done.stdout.splitlines() == ["compiled=True needs llvmlite: pip install llvmlite"] * 2
+    assert done.stderr.count("llvmlite is missing") == 1
 
 
 # --------------------------------------------------------------------- time grids, units, copies

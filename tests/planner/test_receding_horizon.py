@@ -113,10 +113,10 @@ def test_without_noise_every_replan_is_the_rest_of_the_plan(paper):
     x, state = s.start, None
     for k in range(s.nodes - 1):
         _, state = c.predict(np.append(x, s.times[k]), state)
-        (group,) = state.groups
-        np.testing.assert_allclose(group.plans.u[0], c.plan.controls[k:], atol=2e-5)
-        np.testing.assert_allclose(group.plans.x[0], c.plan.mean[k:], atol=2e-5)
-        x = x + s.dt * s.drift(s.times[k], x, group.plans.u[0, 0])
+        np.testing.assert_array_equal(state.interval, [k])
+        np.testing.assert_allclose(state.plans["u"][0, k:], c.plan.controls[k:], atol=2e-5)
+        np.testing.assert_allclose(state.plans["x"][0, k:], c.plan.mean[k:], atol=2e-5)
+        x = x + s.dt * s.drift(s.times[k], x, state.plans["u"][0, k])
     assert c.failures == 0
     assert s.goal_cost(x) < 1.0
 
@@ -127,10 +127,9 @@ def test_numpy_and_compiled_make_the_same_plans(paper, price):
     one, other = (RecedingHorizon(paper, risk_price=price, compiled=c) for c in (True, False))
     obs = around(one, 4, seed=5)
     states = [c.predict(obs)[1] for c in (one, other)]
-    for a, b in zip(states[0].groups, states[1].groups, strict=True):
-        for name in PLAN:
-            ours, theirs = getattr(a.plans, name), getattr(b.plans, name)
-            np.testing.assert_allclose(ours, theirs, atol=1e-8 * (1.0 + np.abs(theirs).max()))
+    for name in PLAN:
+        ours, theirs = (state.plans[name] for state in states)
+        np.testing.assert_allclose(ours, theirs, atol=1e-8 * (1.0 + np.abs(theirs).max()))
 
 
 def test_replanning_beats_the_open_loop_on_the_same_paths(controller, paper):
@@ -208,12 +207,12 @@ def test_state_is_not_written_to_and_starts_reset_single_episodes(controller, pa
     fresh, _ = controller.predict(second)
     mixed, after = controller.predict(second, state, np.array([False, True, False]))
     np.testing.assert_array_equal(mixed, np.stack([on[0], fresh[1], on[2]]))
-    assert len(after.groups) == 1
+    np.testing.assert_array_equal(after.interval, [4, 4, 4])
     # A new episode is known by its time as well; and times may differ within a batch.
     begun = observe(paper, "state", 0.0, paper.start)
     back, later = controller.predict(np.stack([begun, second[1], second[2]]), state)
     np.testing.assert_array_equal(back, np.stack([controller.predict(begun)[0], on[1], on[2]]))
-    assert sorted(g.interval for g in later.groups) == [0, 4]
+    np.testing.assert_array_equal(later.interval, [0, 4, 4])
 
 
 def test_headings_are_known_modulo_a_turn(controller, paper):
@@ -245,14 +244,13 @@ def test_failed_replans_leave_the_last_plan_with_its_feedback(compiled):
     c = RecedingHorizon(cart, compiled=compiled)
     inside, outside = np.array([0.9, -0.2]), np.array([0.8, 1.5])  # where the drift is NaN
     _, state = c.predict(observed(cart, 3, [inside, inside]))
-    (group,) = state.groups
-    plans = group.plans
+    plans = state.plans
     u, state = c.predict(observed(cart, 4, [inside, outside]), state)
-    law = plans.u[1, 1] + plans.gains[1, 1] @ (outside - plans.x[1, 1])
+    law = plans["u"][1, 4] + plans["gains"][1, 4] @ (outside - plans["x"][1, 4])
     np.testing.assert_allclose(u[1], law, rtol=1e-6)
     np.testing.assert_array_equal(state.failures, [0, 1])
     u, state = c.predict(observed(cart, 5, [inside, outside]), state)
-    law = plans.u[1, 2] + plans.gains[1, 2] @ (outside - plans.x[1, 2])
+    law = plans["u"][1, 5] + plans["gains"][1, 5] @ (outside - plans["x"][1, 5])
     np.testing.assert_allclose(u[1], law, rtol=1e-6)
     np.testing.assert_array_equal(state.failures, [0, 2])
     _, state = c.predict(observed(cart, 6, [inside, inside]), state)  # it recovers
@@ -269,13 +267,12 @@ def test_near_an_exact_end_the_last_feedback_law_takes_over():
     x = c.plan.mean + np.array([0.02, -0.01])
     _, state = c.predict(observed(cart, 14, x[14]))
     assert c.replans == 1
-    (group,) = state.groups
+    gains = state.plans["gains"][0]
     for k in (15, 19):
         u, _ = c.predict(observed(cart, k, x[k]), state)
-        i = k - 14
-        law = group.plans.u[0, i] + group.plans.gains[0, i] @ (x[k] - group.plans.x[0, i])
+        law = state.plans["u"][0, k] + gains[k] @ (x[k] - state.plans["x"][0, k])
         np.testing.assert_allclose(u, law, rtol=1e-5)
-        assert np.abs(group.plans.gains[0, i]).max() > 0.1
+        assert np.abs(gains[k]).max() > 0.1
     assert (c.replans, c.failures) == (1, 0)
     early = RecedingHorizon(cart, handover=20)
     early.predict(observed(cart, 1, x[1]))

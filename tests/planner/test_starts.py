@@ -69,28 +69,28 @@ def test_guesses_are_fit_to_start_from(problem, count):
     assert 1 + twice <= len(found) <= count + twice
     assert len({guess.label for guess in found}) == len(found)
     for guess in found:
-        assert guess.states.shape == (len(model.times), len(model.start))
-        assert guess.controls.shape == (len(model.times) - 1, len(model.R))
-        np.testing.assert_array_equal(guess.states[0], model.start)
-        assert np.isfinite(guess.states).all()
-        assert np.all((guess.controls >= model.lower) & (guess.controls <= model.upper))
+        assert guess.x.shape == (len(model.times), len(model.start))
+        assert guess.u.shape == (len(model.times) - 1, len(model.R))
+        np.testing.assert_array_equal(guess.x[0], model.start)
+        assert np.isfinite(guess.x).all()
+        assert np.all((guess.u >= model.lower) & (guess.u <= model.upper))
 
 
 @pytest.mark.parametrize("problem", [WALL, Particle()])
 def test_more_guesses_begin_with_the_fewer_and_repeat(problem):
     few, many, again = (initial_guesses(problem, k) for k in (3, 8, 8))
     for a, b in zip(few, many, strict=False):
-        np.testing.assert_array_equal(a.states, b.states)
+        np.testing.assert_array_equal(a.x, b.x)
     for a, b in zip(many, again, strict=True):
         assert a.label == b.label
-        np.testing.assert_array_equal(a.states, b.states)
-        np.testing.assert_array_equal(a.controls, b.controls)
+        np.testing.assert_array_equal(a.x, b.x)
+        np.testing.assert_array_equal(a.u, b.u)
 
 
 def test_own_guess_is_first():
     for problem in (WALL, Scenario.named("open"), Particle()):
         first, *others = initial_guesses(problem, 5)
-        np.testing.assert_array_equal(first.states, problem.initial_guess()[0])
+        np.testing.assert_array_equal(first.x, problem.initial_guess()[0])
         assert first.free_first
         # The others were made to lie on a side: the penalties must hold them there.
         assert not any(guess.free_first for guess in others)
@@ -99,7 +99,7 @@ def test_own_guess_is_first():
 def test_bumps_are_smooth_keep_both_ends_and_go_both_ways():
     problem = Particle()
     x, _ = problem.initial_guess()
-    bumps = [g.states - x for g in initial_guesses(problem, 11) if g.label.startswith("bump")]
+    bumps = [g.x - x for g in initial_guesses(problem, 11) if g.label.startswith("bump")]
     assert len(bumps) == 10
     for bump in bumps:
         np.testing.assert_allclose(bump[[0, -1]], 0.0, atol=1e-12)
@@ -115,9 +115,9 @@ def test_guesses_along_which_the_model_is_not_finite_are_left_out():
                 return super().drift(t, x, u) + 0.0 * np.sqrt(x[..., 1:2] + 1e-9)
 
     guesses = initial_guesses(Halfplane(), 6)
-    assert len(guesses) < 6 or all(g.states[:, 1].min() >= -1e-9 for g in guesses)
+    assert len(guesses) < 6 or all(g.x[:, 1].min() >= -1e-9 for g in guesses)
     for guess in guesses:
-        assert guess.states[:, 1].min() >= -1e-9
+        assert guess.x[:, 1].min() >= -1e-9
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, "8", True])

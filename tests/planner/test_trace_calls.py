@@ -84,6 +84,10 @@ REFUSED = {
     "integers": (lambda x: x.astype(int), "astype(int64)", False),
     "single precision": (lambda x: x.astype(np.float32), "astype(float32)", False),
     "complex numbers": (lambda x: 1j * x, None, False),
+    "as complex numbers": (lambda x: x.astype(complex), None, None),
+    "complex array, then assigned": (
+        _assigned(lambda x: np.zeros(x.shape, dtype=complex)), None, None,
+    ),
     "strings": (lambda x: x * "2", None, False),
     "none": (lambda x: x * None, None, None),
     "nothing": (lambda x: None, "return", False),

@@ -327,6 +327,37 @@ def test_operations_have_numpys_values_at_extreme_points(name):
         np.testing.assert_array_equal(np.signbit(got[zero]), np.signbit(known[zero]))
 
 
+def _grown(rng, leaves, depth):
+    """A random expression of the leaves, numbers or symbols alike."""
+    if depth == 0 or rng.random() < 0.1:
+        return leaves[rng.integers(len(leaves))]
+    a, b = (_grown(rng, leaves, depth - 1) for _ in range(2))
+    kinds = [
+        lambda: a + b, lambda: a - 0.7 * b, lambda: a * b, lambda: a / (2.0 + b * b),
+        lambda: np.sin(a), lambda: np.exp(-a * a), lambda: np.sqrt(1.0 + a * a),
+        lambda: np.tanh(a), lambda: np.add(0.0, choose(a - b, a, b)),
+        lambda: np.add(0.0, larger(a, b)),
+        lambda: magnitude(a), lambda: np.arctan2(a, 1.5 + b * b),
+    ]  # fmt: skip
+    return kinds[rng.integers(len(kinds))]()
+
+
+def test_random_expressions_have_the_values_of_plain_numpy():
+    count = 60
+    layout = {"x": Field((3,)), "y": Field((count,))}
+
+    def step(rows, carried):
+        x = rows["x"]
+        leaves = [*x, 0.3 + 0.0 * x[0], -1.0 + 0.0 * x[0]]
+        rows.write("y", [_grown(np.random.default_rng(i), leaves, 6) for i in range(count)])
+        return {}
+
+    recursion, arrays = Recursion("random", step, lambda rows: {}), _arrays(layout, 9)
+    native, plain = _both(recursion, layout, arrays, 9)
+    np.testing.assert_allclose(native["y"], plain["y"], rtol=1e-11, atol=1e-11)
+    assert len(np.unique(plain["y"][0])) > count // 2
+
+
 def test_constants_are_kept_to_the_last_bit():
     values = [0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -np.pi, np.inf, -np.inf, np.nan]
     layout = {"y": Field((len(values),))}

@@ -15,7 +15,7 @@ from slipcar.planner.convex.trust_region import (
 
 
 def step(predicted=1.0, actual=1.0, radius=0.1):
-    return Step(radius=radius, predicted=predicted, actual=actual, merit=9.0, before=10.0)
+    return Step(radius=radius, predicted=predicted, actual=actual, before=10.0)
 
 
 def test_paper_schedule_shrinks_by_one_percent():

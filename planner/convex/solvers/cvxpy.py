@@ -20,12 +20,8 @@ _SOLVERS = {
 class CvxpySolver:
     """Writes each sub-problem out anew; tens of milliseconds, nearly all of it modelling.
 
-    Args:
-        solver: any conic solver cvxpy has installed; None takes the first of Clarabel, ECOS,
-            SCS that is.
-
-    Raises:
-        ImportError: if none of them is.
+    `solver` is any conic solver that cvxpy has installed; None takes the first of Clarabel, ECOS,
+    SCS. ImportError if there is none.
     """
 
     def __init__(self, solver: str | None = None) -> None:
@@ -74,18 +70,13 @@ class CvxpySolver:
             return failed(sub, 0, f"{self.solver}: {error}")
         if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or d.value is None:
             return failed(sub, 0, f"{self.solver}: {problem.status}")
-        deviations, corrections = np.asarray(d.value), np.asarray(e.value)
         adjoint = -np.asarray(dynamics.dual_value).reshape(K, n)
-        return Solution(
-            found=problem.status == cp.OPTIMAL,
-            d=deviations,
-            e=corrections,
-            adjoint=adjoint,
-            terminal=_terminal_multiplier(sub, adjoint, deviations),
-            objective=sub.objective(deviations, corrections),
-            iterations=int(problem.solver_stats.num_iters or 0),
-            message="" if problem.status == cp.OPTIMAL else f"{self.solver}: inaccurate",
-        )
+        states, controls = np.asarray(d.value), np.asarray(e.value)
+        terminal = _terminal_multiplier(sub, adjoint, states)
+        solved, objective = problem.status == cp.OPTIMAL, sub.objective(states, controls)
+        iterations = int(problem.solver_stats.num_iters or 0)
+        message = "" if solved else f"{self.solver}: inaccurate"
+        return Solution(solved, states, controls, adjoint, terminal, objective, iterations, message)
 
 
 def _root(blocks: np.ndarray) -> sparse.csr_array:

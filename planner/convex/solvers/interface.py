@@ -47,13 +47,5 @@ class Solver(Protocol):
 
 def failed(sub: Subproblem, iterations: int, message: str) -> Solution:
     """A `Solution` that was not found: zero deviations, infinite objective."""
-    return Solution(
-        found=False,
-        d=np.zeros(sub.f.shape),
-        e=np.zeros(sub.r.shape),
-        adjoint=np.zeros(sub.f.shape),
-        terminal=np.zeros(sub.g.shape),
-        objective=np.inf,
-        iterations=iterations,
-        message=message,
-    )
+    d, e, terminal = (np.zeros(like.shape) for like in (sub.f, sub.r, sub.g))
+    return Solution(False, d, e, d, terminal, np.inf, iterations, message)

@@ -24,8 +24,7 @@ Array = np.ndarray
 class OsqpSolver:
     """Solver for sub-problems of one shape; keeps OSQP's workspace and its last point.
 
-    Args:
-        **settings: passed to OSQP, over this module's defaults.
+    Settings are passed to OSQP, over this module's defaults.
     """
 
     def __init__(self, **settings: object) -> None:
@@ -40,7 +39,7 @@ class OsqpSolver:
             "verbose": False,
             **settings,
         }
-        self._pattern: _Pattern | None = None
+        self._programme: _Programme | None = None
         self._workspace: osqp.OSQP | None = None
 
     def solve(self, sub: Subproblem) -> Solution:
@@ -52,157 +51,114 @@ class OsqpSolver:
         if np.isfinite(sub.radius):
             raise ValueError("osqp cannot take control_radius; use structured or cvxpy")
         shape = (*sub.f.shape, sub.r.shape[1], sub.b.shape[1], len(sub.g))
-        if self._pattern is None or self._pattern.shape != shape:
-            self._pattern, self._workspace = _Pattern(*shape), None
-        result, spent = self._run(sub, slack=False), 0
-        if not _usable(result, sub, self._pattern):
+        if self._programme is None or self._programme.shape != shape:
+            self._programme, self._workspace = _Programme(*shape), None
+        programme = self._programme
+        result, spent = self._run(programme, sub, slack=False), 0
+        price = np.max(np.abs(programme.multipliers(result.y)[1]), initial=0.0)
+        if result.info.status_val != 1 or not price <= sub.rho:
             # The condition cannot be met, or only at a price above ρ: let the slacks open.
             spent = int(result.info.iter)
-            result = self._run(sub, slack=True)
+            result = self._run(programme, sub, slack=True)
         info, spent = result.info, spent + int(result.info.iter)
-        pattern = self._pattern
         if info.status_val not in (1, 2) or not np.isfinite(result.x).all():
             self._workspace = None  # nothing to start the next one from
             return failed(sub, spent, f"OSQP: {info.status}")
-        d, e = pattern.unpack(result.x)
-        adjoint, terminal = pattern.multipliers(result.y)
-        solved = info.status_val == 1
-        return Solution(
-            found=solved,
-            d=d,
-            e=np.clip(e, sub.lower, sub.upper),
-            adjoint=adjoint,
-            terminal=terminal,
-            objective=sub.objective(d, e),
-            iterations=spent,
-            message="" if solved else f"OSQP: {info.status}",
-        )
+        d, e = result.x[programme.d], result.x[programme.e]
+        solved, objective = info.status_val == 1, sub.objective(d, e)
+        message = "" if solved else f"OSQP: {info.status}"
+        adjoint, terminal = programme.multipliers(result.y)
+        e = np.clip(e, sub.lower, sub.upper)
+        return Solution(solved, d, e, adjoint, terminal, objective, spent, message)
 
-    def _run(self, sub: Subproblem, *, slack: bool) -> Any:
-        assert self._pattern is not None
-        P, q, A, low, high = self._pattern.fill(sub, slack=slack)
+    def _run(self, programme: _Programme, sub: Subproblem, *, slack: bool) -> Any:
+        (P, A), (q, low, high) = programme.matrices(sub), programme.vectors(sub, slack=slack)
         if self._workspace is None:
             self._workspace = osqp.OSQP()
-            patterns = self._pattern.P.with_data(P), self._pattern.A.with_data(A)
-            self._workspace.setup(patterns[0], q, patterns[1], low, high, **self._settings)
+            self._workspace.setup(P, q, A, low, high, **self._settings)
         else:
-            self._workspace.update(Px=P, q=q, Ax=A, l=low, u=high)
+            self._workspace.update(Px=P.data, q=q, Ax=A.data, l=low, u=high)
         return self._workspace.solve(raise_error=False)
 
 
-def _usable(result: Any, sub: Subproblem, pattern: _Pattern) -> bool:
-    """Whether the solution with a hard terminal condition is the exact penalty's, too."""
-    if result.info.status_val != 1:
-        return False
-    return bool(np.max(np.abs(pattern.multipliers(result.y)[1]), initial=0.0) <= sub.rho)
+class _Matrix:
+    """A sparse matrix of blocks in given (rows, columns), which keeps the zeros among them."""
+
+    def __init__(self, shape: tuple[int, int], *places: tuple[Array, Array]) -> None:
+        pairs = [np.broadcast_arrays(*place) for place in places]
+        rows, columns = (
+            np.concatenate([part.ravel() for part in parts]) for parts in zip(*pairs, strict=True)
+        )
+        self._order = np.lexsort((rows, columns))
+        self._matrix = sparse.csc_matrix((np.zeros(len(rows)), (rows, columns)), shape)
+
+    def filled(self, *blocks: Array) -> sparse.csc_matrix:
+        """The matrix with these blocks."""
+        self._matrix.data = np.concatenate([block.ravel() for block in blocks])[self._order]
+        return self._matrix
 
 
-class _Csc:
-    """A fixed sparsity pattern that is filled from a list of blocks in a known order."""
-
-    def __init__(self, shape: tuple[int, int], rows: Array, columns: Array) -> None:
-        self.shape = shape
-        self.order = np.lexsort((rows, columns))
-        counts = np.bincount(columns, minlength=shape[1])
-        self.indices = rows[self.order].astype(np.int32)
-        self.indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-
-    def data(self, values: Array) -> Array:
-        return values[self.order]
-
-    def with_data(self, data: Array) -> sparse.csc_matrix:
-        return sparse.csc_matrix((data, self.indices, self.indptr), shape=self.shape)
-
-
-class _Pattern:
-    """Where every number of a sub-problem goes."""
+class _Programme:
+    """½ zᵀPz + qᵀz over low ≤ A z ≤ high: where every number of a sub-problem goes."""
 
     def __init__(self, K: int, n: int, m: int, p: int, q: int) -> None:
         self.shape = (K, n, m, p, q)
-        # Variables.
-        self.d = np.arange(K * n).reshape(K, n)
-        self.e = K * n + np.arange(K * m).reshape(K, m)
-        self.t = K * (n + m) + np.arange(K * p).reshape(K, p)
-        begin = K * (n + m + p)
-        self.plus, self.minus = begin + np.arange(q), begin + q + np.arange(q)
-        self.variables = begin + 2 * q
-        # P: upper triangles of Q and R, the diagonal of h.
-        self.upper_n, self.upper_m = np.triu_indices(n), np.triu_indices(m)
-        P = [
-            (self.d[:, self.upper_n[0]], self.d[:, self.upper_n[1]]),
-            (self.e[:, self.upper_m[0]], self.e[:, self.upper_m[1]]),
-            (self.t, self.t),
-        ]
-        self.P = _Csc((self.variables, self.variables), *_stack(P))
-        # Constraints: dynamics, terminal, hinge rows, bounds on e, t ≥ 0, slacks ≥ 0.
-        rows = np.arange(K * n).reshape(K, n)
-        terminal = K * n + np.arange(q)
-        hinge = K * n + q + np.arange(K * p).reshape(K, p)
-        bound = K * (n + p) + q
-        boxed = np.concatenate([self.e.ravel(), self.t.ravel(), self.plus, self.minus])
-        A = [
-            (rows, self.d),
-            (rows[1:, :, None], self.d[:-1, None, :]),
-            (rows[:, :, None], self.e[:, None, :]),
-            (terminal[:, None], self.d[-1][None, :]),
-            (terminal, self.plus),
-            (terminal, self.minus),
-            (hinge[:, :, None], self.d[:, None, :]),
-            (hinge, self.t),
-            (bound + np.arange(len(boxed)), boxed),
-        ]
-        self.boxed = len(boxed)
-        self.A = _Csc((bound + len(boxed), self.variables), *_stack(A))
+        columns = _numbered((K, n), (K, m), (K, p), (q,), (q,))
+        d, e, t, plus, minus = columns
+        # All but d have limits, in a row each.
+        limited = np.concatenate([column.ravel() for column in columns[1:]])
+        rows = _numbered((K, n), (q,), (K, p), limited.shape)
+        dynamics, terminal, hinges, limits = rows
+        width, height = (sum(each.size for each in part) for part in (columns, rows))
+        self.d, self.e, self.plus, self.minus, self.width = d, e, plus, minus, width
+        self.dynamics, self.terminal = dynamics, terminal
+        self.upper = np.triu_indices(n), np.triu_indices(m)
+        triangles = [(z[:, i], z[:, j]) for z, (i, j) in zip((d, e), self.upper, strict=True)]
+        self.P = _Matrix((width, width), *triangles, (t, t))
+        self.A = _Matrix(
+            (height, width),
+            (dynamics, d),
+            (dynamics[1:, :, None], d[:-1, None, :]),
+            (dynamics[:, :, None], e[:, None, :]),
+            (terminal[:, None], d[-1]),
+            (terminal, plus),
+            (terminal, minus),
+            (hinges[:, :, None], d[:, None, :]),
+            (hinges, t),
+            (limits, limited),
+        )
 
-    def fill(self, sub: Subproblem, *, slack: bool) -> tuple[Array, Array, Array, Array, Array]:
-        """P and A data, q, lower and upper limits; the terminal slacks open or held at 0."""
-        K, _, _, p, q = self.shape
-        P = [
-            sub.Q[:, self.upper_n[0], self.upper_n[1]],
-            sub.R[:, self.upper_m[0], self.upper_m[1]],
-            sub.h,
-        ]
-        linear = np.zeros(self.variables)
+    def matrices(self, sub: Subproblem) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
+        """P (its upper triangle) and A."""
+        (rows, columns), (u_rows, u_columns) = self.upper
+        one, ones = np.ones(len(sub.g)), np.ones(sub.b.shape)
+        P = self.P.filled(sub.Q[:, rows, columns], sub.R[:, u_rows, u_columns], sub.h)
+        limited = np.ones(self.width - sub.f.size)
+        A = self.A.filled(
+            np.ones(sub.f.shape), -sub.A[1:], -sub.B, sub.G, -one, one, sub.a, -ones, limited
+        )
+        return P, A
+
+    def vectors(self, sub: Subproblem, *, slack: bool) -> tuple[Array, Array, Array]:
+        """q, low and high; the terminal slacks open or held at zero."""
+        linear = np.zeros(self.width)
         linear[self.d], linear[self.e] = sub.q, sub.r
         linear[self.plus] = linear[self.minus] = sub.rho if slack else 0.0
-        one_q, one_hinge = np.ones(q), np.ones((K, p))
-        A = [
-            np.ones(sub.f.shape),
-            -sub.A[1:],
-            -sub.B,
-            sub.G,
-            -one_q,
-            one_q,
-            sub.a,
-            -one_hinge,
-            np.ones(self.boxed),
-        ]
-        f, b, inf = sub.f.ravel(), sub.b.ravel(), np.inf
-        zeros = np.zeros(K * p + 2 * q)
-        ceiling = np.full(2 * q, inf if slack else 0.0)
-        low = np.concatenate(
-            [f, -sub.g - sub.tolerance, np.full(K * p, -inf), sub.lower.ravel(), zeros]
-        )
-        high = np.concatenate(
-            [f, -sub.g + sub.tolerance, -b, sub.upper.ravel(), np.full(K * p, inf), ceiling]
-        )
-        return self.P.data(_flatten(P)), linear, self.A.data(_flatten(A)), low, high
-
-    def unpack(self, x: Array) -> tuple[Array, Array]:
-        return x[self.d], x[self.e]
+        f, b, infinite = sub.f.ravel(), sub.b.ravel(), np.full(sub.b.size, np.inf)
+        zeros = np.zeros(sub.b.size + 2 * len(sub.g))
+        ceiling = np.full(2 * len(sub.g), np.inf if slack else 0.0)
+        tau = sub.tolerance
+        low = [f, -sub.g - tau, -infinite, sub.lower.ravel(), zeros]
+        high = [f, -sub.g + tau, -b, sub.upper.ravel(), infinite, ceiling]
+        return linear, np.concatenate(low), np.concatenate(high)
 
     def multipliers(self, y: Array) -> tuple[Array, Array]:
-        K, n, _, _, q = self.shape
-        return -y[: K * n].reshape(K, n), y[K * n : K * n + q]
+        """λ (K, n) and ν (q,)."""
+        return -y[self.dynamics], y[self.terminal]
 
 
-def _stack(entries: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    pairs = [np.broadcast_arrays(r, c) for r, c in entries]
-    return (
-        np.concatenate([r.ravel() for r, _ in pairs]),
-        np.concatenate([c.ravel() for _, c in pairs]),
-    )
-
-
-def _flatten(parts: list[Array]) -> Array:
-    return np.concatenate([part.ravel() for part in parts])
+def _numbered(*shapes: tuple[int, ...]) -> list[Array]:
+    """Consecutive numbers in arrays of these shapes."""
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    parts = zip(np.split(np.arange(ends[-1]), ends[:-1]), shapes, strict=True)
+    return [part.reshape(shape) for part, shape in parts]

@@ -1,63 +1,88 @@
 """Newton's method on active sets for the sub-problem: a few LQ problems, each one banded solve.
 
 The sub-problem is a linear-quadratic problem but for convex piecewise quadratics: hinge rows,
-control bounds and the exact terminal penalty. Which piece each of them is on is the *active
-set*; given it, the optimality conditions are linear (:mod:`.lq_problem`). The solution says which
-pieces it lies on; when they are the assumed ones, it is the optimum, to machine precision.
-Whole steps settle this in one to seven solves as a rule; where they do not, an exact line search
-on the convex objective shortens those that would raise it. What does not settle soon (many
-bounds active, a terminal condition that cannot be met) goes to :mod:`.interior_point`, whose
-solution's active set is then polished here.
+limits of the controls and the exact terminal penalty. Which piece each of them is on is the
+*active set*; given it, the optimality conditions are linear (:mod:`.lq_problem`). The solution
+says which pieces it lies on; when they are the assumed ones, it is the optimum, to machine
+precision. This takes one to seven solves as a rule. What does not settle soon (many bounds
+active, a terminal condition that cannot be met) goes to :mod:`.interior_point`, whose solution's
+active set is then polished here.
 """
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
-from slipcar.planner.convex.solvers.active_set import ActiveSet, ControlLimits, Pieces
 from slipcar.planner.convex.solvers.interface import Solution, failed
 from slipcar.planner.convex.solvers.interior_point import interior_point
-from slipcar.planner.convex.solvers.lq_problem import LqProblem
-from slipcar.planner.convex.subproblem import Subproblem
+from slipcar.planner.convex.solvers.lq_problem import End, LqProblem
+from slipcar.planner.convex.subproblem import Held, Subproblem
 from slipcar.planner.lq.banded import PrimalDual
+
+Array = np.ndarray
 
 #: Solves before the interior point takes over: so many and one more for each `_NODES` nodes (the
 #: first sub-problem needs 8 at 41 nodes, 15 at 321, 20 at 481); and those it leaves for polishing.
-_SOLVES, _NODES, _POLISHING_SOLVES = 20, 16, 8
-#: So many steps are whole, whatever they do to the objective: most searches end within them.
-_WHOLE_STEPS = 10
+_SOLVES, _NODES, _POLISHING_SOLVES = 12, 16, 8
+#: The terminal condition gives way by this much as its multiplier reaches ρ: keeps the matrix
+#: regular where the linearised dynamics cannot reach a direction, and ν then comes out beyond ρ.
+_TERMINAL_WIDTH = 1e-10
 
 
-@dataclasses.dataclass(frozen=True)
-class _Search:
-    """How a search for the active set ended: its point, or None; LQ solves."""
+class ActiveSet(NamedTuple):
+    """Which piece every piecewise quadratic is on.
+
+    Attributes:
+        hinge: hinges that push, (K, p) bool.
+        terminal: of the terminal penalty, (q,) signed: 0 inside the box, ±1 held at its side,
+            ±2 multiplier at ±ρ.
+        held: controls on the boundary of U.
+    """
+
+    hinge: Array
+    terminal: Array
+    held: Held
+
+    def same_as(self, other: ActiveSet) -> bool:
+        """Whether all are on the same pieces."""
+        return (
+            bool((self.hinge == other.hinge).all())
+            and (self.terminal is other.terminal or bool((self.terminal == other.terminal).all()))
+            and self.held.same_as(other.held)
+        )
+
+
+class _Search(NamedTuple):
+    """How a search for the active set ended: its point, or None, the active set, LQ solves."""
 
     point: PrimalDual | None
-    limits: ControlLimits | None
+    active: ActiveSet
     solves: int
 
 
 class StructuredSolver:
-    """Solver for sub-problems of one shape; remembers the last active limits as a warm start."""
+    """Solver for sub-problems of one shape; remembers which controls were held as a warm start."""
 
     def __init__(self) -> None:
         self._lq: LqProblem | None = None
-        self._limits: ControlLimits | None = None
+        self._held: Held | None = None
 
     def solve(self, sub: Subproblem) -> Solution:
         """Solve one sub-problem; see the module's docstring."""
         shape = (*sub.f.shape, len(sub.g))
         if self._lq is None or self._lq.shape != shape:
-            self._lq, self._limits = LqProblem(*shape), None
+            self._lq, self._held = LqProblem(*shape), None
         self._lq.load(sub)
-        pieces = Pieces(sub)
-        limit = _SOLVES + len(sub.f) // _NODES
-        search = _newton(self._lq, pieces, pieces.start(self._limits), limit)
+        if self._held is None or not sub.limited:
+            self._held = Held.nothing(*sub.r.shape)
+        # Hinges on at the iterate, limits of the last solution, the terminal condition held.
+        start = ActiveSet(sub.b > 0.0, np.ones(len(sub.g), dtype=np.int64), self._held)
+        search = _newton(self._lq, start, _SOLVES + len(sub.f) // _NODES)
         if search.point is None or np.abs(search.point.terminal).max(initial=0.0) > sub.rho:
-            search = _from_inside(self._lq, pieces, search.solves)
-        self._limits, point = search.limits, search.point
+            search = _from_inside(self._lq, start, search.solves)
+        self._held, point = search.active.held, search.point
         if point is None:
             return failed(sub, search.solves, f"not solved after {search.solves} LQ solves")
         e = sub.admissible(point.e)
@@ -65,47 +90,74 @@ class StructuredSolver:
         return Solution(True, point.d, e, point.adjoint, point.terminal, objective, search.solves)
 
 
-def _newton(lq: LqProblem, pieces: Pieces, active: ActiveSet, limit: int) -> _Search:
-    """The point that lies on the pieces it was computed with, and its limits."""
-    point: PrimalDual | None = None
-    cost: float | None = None  # of the point; computed only when a line search may be needed
+def _newton(lq: LqProblem, start: ActiveSet, limit: int) -> _Search:
+    """The point that lies on the pieces it was computed with."""
+    sub, active, terminal = lq.sub, start, None
     for solves in range(1, limit + 1):
-        target = lq.solve(pieces.terms(active))
-        if target is None:
-            return _Search(None, None, solves)
-        wanted = pieces.active_set(target, active)
-        if wanted.same_as(active):
-            return _Search(target, wanted.limits, solves)
-        # (Across a sphere the objective with its stiffness would let no step pass.)
-        if point is None or solves <= _WHOLE_STEPS or pieces.balls:
-            point = target
+        weight, controls = sub.h * active.hinge, None
+        if active.held.any:
+            controls = sub.free_controls(active.held, sub.R, sub.r)
+        if active.terminal is not terminal:  # which rarely changes
+            terminal, end = active.terminal, _end(sub, active.terminal)
+        point = lq.solve(weight, weight * sub.b, end, controls)
+        if point is None:
+            return _Search(None, start, solves)
+        reached = _active_set(sub, point, active)
+        if reached.same_as(active):
+            return _Search(point, reached, solves)
+        active = reached
+    return _Search(None, start, limit)
+
+
+def _end(sub: Subproblem, terminal: Array) -> End:
+    """Terminal rows on these pieces."""
+    softness = _TERMINAL_WIDTH * max(1.0, float(np.abs(sub.g).max(initial=0.0))) / sub.rho
+    held = np.abs(terminal) == 1
+    side = np.where(held, np.sign(terminal) * sub.tolerance - sub.g, terminal // 2 * sub.rho)
+    return End(held, np.where(held, softness, 1.0), side)
+
+
+def _active_set(sub: Subproblem, point: PrimalDual, before: ActiveSet | None) -> ActiveSet:
+    """Pieces that a point lies on; it was computed on those `before`, or by the interior point."""
+    terminal = None if before is None else before.terminal
+    if terminal is None or sub.tolerance > 0.0:
+        # What is held shows no residual: its multiplier tells where it wants to go. Only the
+        # interior point puts a multiplier at its limit: doing it while the hinges are still
+        # unsettled costs many more solves.
+        size = 1.0 + np.abs(sub.g)
+        pressed = sub.G @ point.d[-1] + sub.g + point.terminal * size / sub.rho
+        sign = np.where(pressed < 0.0, -1, 1)
+        side = np.where((np.abs(pressed) > sub.tolerance) | (sub.tolerance == 0.0), sign, 0)
+        if terminal is None:
+            terminal = np.where(np.abs(pressed) > sub.tolerance + size, 2 * sign, side)
         else:
-            cost = pieces.cost(point) if cost is None else cost
-            target_cost = pieces.cost(target)
-            step = 1.0 if target_cost <= cost else pieces.line_search(point, target)
-            if step > 1.0 - 1e-10:
-                point, cost = target, target_cost
-            else:
-                point = point.towards(target, step)
-                cost = pieces.cost(point)
-                wanted = pieces.active_set(point, active)
-        active = wanted
-    return _Search(None, None, limit)
+            terminal = np.where(np.abs(terminal) == 2, terminal, side)
+    if before is not None and not before.held.any and sub.strictly_inside(point.e):
+        held = before.held
+    else:
+        held = sub.held(point.e, sub.slope(point.e, point.adjoint))
+    return ActiveSet(sub.hinge_arguments(point.d) > 0.0, terminal, held)
 
 
-def _from_inside(lq: LqProblem, pieces: Pieces, spent: int) -> _Search:
+def _from_inside(lq: LqProblem, start: ActiveSet, spent: int) -> _Search:
     """The interior point's solution, polished by Newton's method where that makes it better."""
-    interior = interior_point(pieces.sub, lq)
-    spent += interior.solves
-    if interior.point is None:
-        return _Search(None, None, spent)
-    near = pieces.near(interior.point, interior.press)
-    polished = _newton(lq, pieces, near, _POLISHING_SOLVES)
+    sub = lq.sub
+    interior, solves = interior_point(sub, lq)
+    if interior is None:
+        return _Search(None, start, spent + solves)
+    near = _active_set(sub, interior, None)
+    polished = _newton(lq, near, _POLISHING_SOLVES)
     # The last interior systems are ill-conditioned: judge what the controls really do.
-    best, spheres = pieces.replayed(interior.point), near.limits.spheres
-    if polished.point is not None and polished.limits is not None:
-        candidate, objective = pieces.replayed(polished.point), pieces.sub.objective
-        value = objective(best.d, best.e)
-        if objective(candidate.d, candidate.e) <= value + 1e-9 * (1.0 + abs(value)):
-            best, spheres = candidate, polished.limits.spheres
-    return _Search(best, pieces.limits_near(best, spheres), spent + polished.solves)
+    best, active = _replayed(sub, interior), near
+    if polished.point is not None:
+        candidate = _replayed(sub, polished.point)
+        value = sub.objective(best.d, best.e)
+        if sub.objective(candidate.d, candidate.e) <= value + 1e-9 * (1.0 + abs(value)):
+            best, active = candidate, polished.active
+    return _Search(best, active, spent + solves + polished.solves)
+
+
+def _replayed(sub: Subproblem, point: PrimalDual) -> PrimalDual:
+    """The point with its controls made admissible and the states they lead to."""
+    e = sub.admissible(point.e)
+    return point._replace(d=sub.response(e), e=e)
