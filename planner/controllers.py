@@ -18,6 +18,7 @@ from slipcar.planner.moments.gains import closed_loop_covariance, weight_matrix,
 from slipcar.planner.plan import Plan
 from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
 from slipcar.planner.problem.model import model_of
+from slipcar.planner.search.replanning import applied
 
 Array = np.ndarray
 
@@ -36,6 +37,7 @@ class OpenLoop:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
+        self._angles = tuple(getattr(plan.problem, "angles", ()))
 
     @property
     def preparation_time(self) -> float:
@@ -83,7 +85,7 @@ class OpenLoop:
 
     def _numbers(self) -> list[Array]:
         lower, upper, radius = self._limits()
-        angles = np.asarray(getattr(self.plan.problem, "angles", ()), dtype=np.int64)
+        angles = np.asarray(self._angles, dtype=np.int64)
         return [self.plan.times, self.plan.controls, lower, upper, np.array([radius]), angles]
 
     def _limits(self) -> tuple[Array, Array, float]:
@@ -129,7 +131,7 @@ class Feedback(OpenLoop):
     Args:
         plan: what to follow.
         Q: weight on deviations: scalar, (n,) or (n, n); default diag(10, 10, 1, 1, 1) for five
-            states (SPEC §6), the identity otherwise.
+            states, the identity otherwise.
         R: weight on corrections; default the problem's control weight (or identity).
         Qf: weight on the final deviation; default 100.
 
@@ -155,7 +157,6 @@ class Feedback(OpenLoop):
         if gains.shape != wanted or not np.isfinite(gains).all():
             raise ValueError(f"gains must be finite and of shape {wanted}, not {gains.shape}")
         super().__init__(plan.replace(gains=gains))
-        self._angles = tuple(getattr(plan.problem, "angles", ()))
         self._admissible = self._limits()
 
     def control(self, t: Any, x: Any) -> Array:
@@ -163,9 +164,8 @@ class Feedback(OpenLoop):
         k = self._interval(t)
         error = wrap(np.asarray(x) - self.plan.mean[k], self._angles)
         assert self.plan.gains is not None
-        # A sum over states rather than a matrix product: the same bits for any batch size.
-        correction = (self.plan.gains[k] * error[..., None, :]).sum(axis=-1)
-        return project_controls(self.plan.controls[k] + correction, *self._admissible)
+        u = self.plan.controls[k] + applied(self.plan.gains[k], error)
+        return project_controls(u, *self._admissible)
 
     def preview(self, state: Any = None, row: int = 0) -> tuple[Array, Array | None]:
         """The plan and the covariances (N, n, n) of the closed loop; see `OpenLoop.preview`."""

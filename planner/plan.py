@@ -28,42 +28,63 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """Open-loop controls, the mean they steer and the covariance predicted around it."""
+    """Open-loop controls, the mean they steer and the covariance predicted around it.
 
-    status: Status  #: how planning ended; only CONVERGED is an answer
-    times: Array  #: nodes, (N,) [s]
-    mean: Array  #: μ, (N, n), in the units of the problem's state
-    controls: Array  #: u, (N−1, m), constant on each interval
-    #: Σ, (N, n, n); the first is the problem's `start_covariance`, zero by default
+    Attributes:
+        status: how planning ended; only CONVERGED is an answer.
+        times: nodes, (N,) [s].
+        mean: μ, (N, n), in the units of the problem's state.
+        controls: u, (N−1, m), constant on each interval.
+        covariance: Σ, (N, n, n); the first is the problem's `start_covariance`, zero by default.
+        effort: Σ dt uᵀRu.
+        obstacle_cost: Σ dt Σ w max(0, c(μ))².
+        running_cost: Σ dt (H(μ) + ℓ(μ)ᵀu), the problem's smooth running costs.
+        variance: ∫ tr Σ dt.
+        iterations: sub-problems solved.
+        history: one :class:`Iteration` for each.
+        guess: states the iteration started from, (N, n).
+        multipliers: of the last sub-problem.
+        A: Jacobians ∂x⁺/∂x of the integrator's steps along the plan, I + dt ∂b/∂x for Euler's,
+            (N−1, n, n).
+        B: ∂x⁺/∂u, dt ∂b/∂u for Euler's, (N−1, n, m).
+        gains: feedback gains, (N−1, m, n), or None.
+        solve_time: wall-clock seconds of `plan`, callback included.
+        options: what `plan` was called with.
+        problem: the problem planned for; None after loading if it could not be saved.
+        message: what is lacking, the solver's own words if it failed, which guess was taken.
+        alternatives: what became of each guess, the best first, when there were several starts.
+        time_search: every horizon tried, when the final time was free.
+        shot: the last attempt at shooting, when it was asked for and one was made; not saved.
+        expected: what the plan costs in expectation, when it was made for that: with `risk`,
+            `risk_price`, `feedback` or `expected`. The history is then that of the plan of the
+            mean it started from, and `covariance` is that of the closed loop.
+        risk: requested, predicted and verified probability of a violation, when one was asked for.
+    """
+
+    status: Status
+    times: Array
+    mean: Array
+    controls: Array
     covariance: Array
-    effort: float  #: Σ dt uᵀRu
-    obstacle_cost: float  #: Σ dt Σ w max(0, c(μ))²
-    running_cost: float  #: Σ dt (H(μ) + ℓ(μ)ᵀu), the problem's smooth running costs
-    variance: float  #: ∫ tr Σ dt
-    iterations: int  #: sub-problems solved
-    history: Sequence[Iteration]  #: one :class:`Iteration` for each
-    guess: Array  #: states the iteration started from, (N, n)
-    multipliers: Multipliers  #: of the last sub-problem
-    #: Jacobians ∂x⁺/∂x of the integrator's steps along the plan, I + dt ∂b/∂x for Euler's, (N−1,
-    #: n, n)
+    effort: float
+    obstacle_cost: float
+    running_cost: float
+    variance: float
+    iterations: int
+    history: Sequence[Iteration]
+    guess: Array
+    multipliers: Multipliers
     A: Array
-    B: Array  #: ∂x⁺/∂u, dt ∂b/∂u for Euler's, (N−1, n, m)
-    gains: Array | None  #: feedback gains, (N−1, m, n), or None
-    solve_time: float  #: wall-clock seconds of `plan`, callback included
-    options: dict[str, Any]  #: what `plan` was called with
-    problem: Problem | None  #: the problem planned for; None after loading if it could not be saved
-    #: what is lacking, the solver's own words if it failed, which guess was taken
+    B: Array
+    gains: Array | None
+    solve_time: float
+    options: dict[str, Any]
+    problem: Problem | None
     message: str = ""
-    #: what became of each guess, the best first, when there were several starts
     alternatives: tuple[Alternative, ...] = ()
-    time_search: tuple[TimeStep, ...] = ()  #: every horizon tried, when the final time was free
-    #: the last attempt at shooting, when it was asked for and one was made; not saved
+    time_search: tuple[TimeStep, ...] = ()
     shot: Shot | None = None
-    #: what the plan costs in expectation, when it was made for that: with `risk`, `risk_price`,
-    #: `feedback` or `expected`. The history is then that of the plan of the mean it started from,
-    #: and `covariance` is that of the closed loop.
     expected: ExpectedCost | None = None
-    #: requested, predicted and verified probability of a violation, when one was asked for
     risk: Risk | None = None
 
     @property

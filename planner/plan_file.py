@@ -72,6 +72,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"{path} is not a plan or is damaged: {error}") from error
     if version not in _READ:
         raise ValueError(f"{path} has plan format {version!r}; this version reads {_FORMAT}")
+    expected, risk = header.get("expected"), header.get("risk")  # not in format 2
     try:
         return {
             **{name: arrays[name] for name in _ARRAYS if name != "gains"},
@@ -84,10 +85,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
             "problem": _problem_from_data(header["problem"]),
             "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
             "time_search": tuple(records.TimeStep(**row) for row in header["time_search"]),
-            "expected": records.ExpectedCost(**header["expected"])
-            if header.get("expected")
-            else None,
-            "risk": Risk.from_dict(header["risk"]) if header.get("risk") else None,
+            "expected": records.ExpectedCost(**expected) if expected else None,
+            "risk": Risk.from_dict(risk) if risk else None,
         }
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a plan or is damaged: {error!r}") from error

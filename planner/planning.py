@@ -118,12 +118,8 @@ class _Planning:
 
     def run(self) -> Plan:
         """Check, plan, and put the plan together."""
-        model, options, guesses, wanted = (
-            self.model,
-            self.options,
-            self.guesses,
-            self.request.wanted,
-        )
+        model, options, guesses = self.model, self.options, self.guesses
+        wanted = self.request.wanted
         if wanted:
             self.request.check(options, model)
         if guesses.free_final_time:

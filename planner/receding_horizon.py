@@ -38,9 +38,8 @@ class Underway:
     """What a receding-horizon controller remembers of E episodes; not to be written to."""
 
     interval: Array  #: at which each episode's plan begins, (E,)
-    plans: (
-        replanning.Plans
-    )  #: over the whole horizon, (E, K, ...); of no meaning before their interval
+    #: over the whole horizon, (E, K, ...); of no meaning before their interval
+    plans: replanning.Plans
     failures: Array  #: replans that failed so far in each episode, (E,)
 
 
@@ -84,8 +83,7 @@ class RecedingHorizon(OpenLoop):
 
     Raises:
         TypeError: if the problem lacks a required member.
-        ValueError: for an argument out of range, a `control_radius`, a `risk_price` without
-            `problem.constraint`, or a horizon too short for the terminal condition.
+        ValueError: for an argument out of range, or a problem it does not know.
     """
 
     closed_loop = True
@@ -133,7 +131,7 @@ class RecedingHorizon(OpenLoop):
             self._replanner.posed, stakes, nominal.mean, nominal.controls,
             tolerance=float(tolerance), max_iterations=_FIRST,
         )  # fmt: skip
-        self._first: replanning.Plans = {name: getattr(steered, name) for name in FIELDS}
+        self._first: replanning.Plans = {name: getattr(steered, name) for name in replanning.FIELDS}
         super().__init__(
             nominal.replace(
                 **steered_fields(steered, model),
@@ -142,7 +140,6 @@ class RecedingHorizon(OpenLoop):
                 message="",
             )
         )
-        self._angles = tuple(getattr(problem, "angles", ()))
         self.replans, self.failures, self.seconds = 0, 0, 0.0
 
     @property

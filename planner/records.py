@@ -101,8 +101,10 @@ class Multipliers:
     def of(cls, adjoint: Array, terminal: Array, trust_multiplier: float, A: Array) -> Multipliers:
         """From λ_1..λ_K (K, n), ν (q,) and the trust region's weight of a sub-problem."""
         # λ_0 follows from the adjoint equation at node 0, where no cost is charged.
-        start = A[0].T @ adjoint[0]
-        return cls(-terminal, -1.0, -trust_multiplier, -np.vstack([start, adjoint]))
+        p = np.empty((len(adjoint) + 1, adjoint.shape[1]))
+        np.negative(adjoint, out=p[1:])
+        p[0] = A[0].T @ p[1]
+        return cls(-terminal, -1.0, -trust_multiplier, p)
 
     def normalized(self) -> Multipliers:
         """Scaled so that (𝔭, p⁰, p¹) has norm one."""

@@ -138,7 +138,7 @@ class AdaptiveTrustRegion(TrustRegion):
         ratio = step.actual / max(step.predicted, 1e-300)
         # At the end rounding errors are all that is left of both: no reason to change anything.
         noise = _MERIT_NOISE * (1.0 + abs(step.before))
-        if step.predicted <= noise and step.actual >= -noise:
+        if step.predicted <= noise and step.actual > -noise:
             ratio = 0.5
         if ratio < 1e-3:
             self._rejected += 1

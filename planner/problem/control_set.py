@@ -64,7 +64,7 @@ def project_controls(u: Array, lower: Array, upper: Array, radius: float = np.in
     With the multiplier ν ≥ 0 of the ball the nearest point is clip(u / (1 + ν)), whose norm
     falls as ν grows: a bisection on 1 / (1 + ν) finds where it meets the radius.
     """
-    inside = np.clip(u, lower, upper)
+    inside = np.minimum(np.maximum(u, lower), upper)
     if not np.isfinite(radius):
         return inside
     outside = np.linalg.norm(inside, axis=-1) > radius

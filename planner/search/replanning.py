@@ -93,7 +93,7 @@ class Replanner:
 
 def applied(gains: Array, error: Array) -> Array:
     """K e, (..., m), for gains (..., m, n) and errors (..., n)."""
-    # A sum rather than a matrix product: the same bits for any number of episodes.
+    # A sum rather than a matrix product: the same bits for batches of any size.
     return np.add.reduce(gains * error[..., None, :], axis=-1)
 
 

@@ -109,7 +109,7 @@ class Request:
         return self.feedback or self.expected or priced
 
     def check(self, options: Options, model: Model) -> None:
-        """Raise ValueError for what an expected cost cannot be combined with."""
+        """Raise ValueError for what an expected cost cannot be combined with, or constraints."""
         if options.convex:
             raise ValueError(
                 f"risk, feedback and expected cannot be combined with {options.convex}"
@@ -122,6 +122,7 @@ class Request:
                 f"risk needs the problem's constraint(t, x) -> (..., p), violated where > 0; "
                 f"{type(model.problem).__name__} has none"
             )
+        model.constraint_count()
 
     def stakes(self, model: Model, variance_weight: float) -> Stakes:
         """What to charge, constraints at price zero.
