@@ -13,7 +13,7 @@ import numpy as np
 
 from slipcar.planner import plan
 from slipcar.planner.extremal.certificate import violations
-from slipcar.planner.extremal.planned import model_for
+from slipcar.planner.extremal.maximum_principle import model_for
 from slipcar.planner.extremal.shooting import START_WITHIN, retry_within, shoot_from
 
 Array = np.ndarray

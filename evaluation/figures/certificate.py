@@ -12,8 +12,12 @@ from matplotlib.ticker import MaxNLocator
 from slipcar.envs.car import CONTROL_NAMES, CONTROL_UNITS
 from slipcar.evaluation.figures.scene import GREY, INK, PALETTE, PAPER, new_figure, style
 from slipcar.planner.extremal.certificate import certify
-from slipcar.planner.extremal.maximum_principle import best_step, first_order, hamiltonian
-from slipcar.planner.extremal.planned import model_for
+from slipcar.planner.extremal.maximum_principle import (
+    best_step,
+    first_order,
+    hamiltonian,
+    model_for,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

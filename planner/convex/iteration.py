@@ -159,14 +159,11 @@ class _Attempt:
                 self.acceleration.forget()
             seconds = self.linearize_seconds + time.perf_counter() - solved, solved - clock
             self.linearize_seconds = 0.0
-            self.history.append(self.record(proposal, new, accepted, *seconds))
+            self.history.append(self.record(proposal, new, accepted, seconds))
             unlimited = self.limit_controls(proposal, new, accepted)
             stop = options.callback is not None and options.callback(self.history[-1])
             if accepted:
                 status = self.accept(proposal, new, np.inf if unlimited else proposal.step)
-                if status is Status.INFEASIBLE:
-                    lacks = what_lacks(self.at.lin, options.terminal_tolerance, self.size)
-                    return self.outcome(status, lacks)
                 if status is not None:
                     return self.outcome(status)
             elif trust.collapsed:
@@ -184,15 +181,10 @@ class _Attempt:
                 weight = self.trust_weight()
             multiplier = trust.multiplier
             sub = convexify(
-                model,
-                self.at.lin,
-                variance=self.at.variance,
-                composite=self.composite,
-                trust_multiplier=multiplier,
-                trust_weight=weight,
-                rho=self.rho,
-                tolerance=options.terminal_tolerance,
-            )
+                model, self.at.lin, variance=self.at.variance, composite=self.composite,
+                trust_multiplier=multiplier, trust_weight=weight,
+                rho=self.rho, tolerance=options.terminal_tolerance,
+            )  # fmt: skip
             solution = self.solver.solve(sub)
             if not solution.found:
                 return _Proposal(sub, solution, np.nan, multiplier, np.nan)
@@ -293,51 +285,32 @@ class _Attempt:
         return 1.0 + float(np.abs(self.at.lin.x).max())
 
     def record(
-        self,
-        proposal: _Proposal,
-        new: _Candidate,
-        accepted: bool,
-        linearize_seconds: float,
-        solve_seconds: float,
+        self, proposal: _Proposal, new: _Candidate, accepted: bool, seconds: tuple[float, float]
     ) -> Iteration:
-        """A row of the history."""
+        """A row of the history, with seconds of linearising and of solving."""
         lin, variance, solution = new.at.lin, new.at.variance, proposal.solution
         return Iteration(
-            mean=lin.x,
-            controls=lin.u,
-            effort=lin.effort,
-            penalty=lin.penalty,
-            running=lin.running,
+            mean=lin.x, controls=lin.u,
+            effort=lin.effort, penalty=lin.penalty, running=lin.running,
             variance=np.nan if variance is None else variance.total / self.options.variance_weight,
-            merit=new.merit,
-            predicted=new.predicted,
-            actual=new.actual,
-            step=proposal.step,
-            trust_radius=proposal.radius,
-            trust_multiplier=proposal.multiplier,
+            merit=new.merit, predicted=new.predicted, actual=new.actual, step=proposal.step,
+            trust_radius=proposal.radius, trust_multiplier=proposal.multiplier,
             virtual_control=proposal.sub.virtual_control(solution.d),
             defect=float(np.abs(lin.defect).max()),
             terminal_residual=float(np.abs(lin.g).max(initial=0.0)),
             terminal_multiplier=solution.terminal,
-            accepted=accepted,
-            solver_iterations=solution.iterations,
-            linearize_seconds=linearize_seconds,
-            solve_seconds=solve_seconds,
-        )
+            accepted=accepted, solver_iterations=solution.iterations,
+            linearize_seconds=seconds[0], solve_seconds=seconds[1],
+        )  # fmt: skip
 
     def outcome(self, status: Status, message: str = "") -> Outcome:
         """What has been reached, with controls that are admissible however it ended."""
         model, weight, lin = self.model, self.options.variance_weight, self.at.lin
+        if status is Status.INFEASIBLE:
+            message = what_lacks(lin, self.options.terminal_tolerance, self.size)
         if not status.ok and not np.array_equal(inside := model.admissible(lin.u), lin.u):
             lin = linearize(model, lin.x, inside)
         return Outcome.at(
-            lin,
-            model,
-            weight,
-            status=status,
-            adjoint=self.adjoint,
-            terminal=self.terminal,
-            history=tuple(self.history),
-            trust_multiplier=self.trust_multiplier,
-            message=message,
-        )
+            lin, model, weight, status=status, adjoint=self.adjoint, terminal=self.terminal,
+            history=tuple(self.history), trust_multiplier=self.trust_multiplier, message=message,
+        )  # fmt: skip

@@ -21,6 +21,7 @@ With deviations d_k = μ_k − μ̄_k and e_k = u_k − ū_k, K = N − 1 interv
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,14 +59,32 @@ class Held:
 
     def same_as(self, other: Held) -> bool:
         """Whether the same controls are held, and along the same tangents."""
-        if self is other:
-            return True
-        masks = ((a.lower, a.upper, a.on) for a in (self, other))
-        if any((a != b).any() for a, b in zip(*masks, strict=True)):
-            return False
-        turned = np.max(np.abs(self.turn - other.turn), initial=0.0)
-        pressed = np.max(np.abs(self.press - other.press), initial=0.0)
-        return bool(turned <= 1e-9 and pressed <= 1e-6 * (1.0 + np.max(self.press, initial=0.0)))
+        return self is other or bool(
+            (self.lower == other.lower).all()
+            and (self.upper == other.upper).all()
+            and (self.on == other.on).all()
+            and np.abs(self.turn - other.turn).max() <= 1e-9
+            and np.abs(self.press - other.press).max() <= 1e-6 * (1.0 + self.press.max())
+        )
+
+
+class Pieces(NamedTuple):
+    """Which piece every kink is on: hinges that push (K, p) bool, terminal rows (q,), controls.
+
+    Of the terminal penalty: 0 inside the box, ±1 held at its side, ±2 multiplier at ±ρ.
+    """
+
+    hinge: Array
+    terminal: Array
+    held: Held
+
+    def same_as(self, other: Pieces) -> bool:
+        """Whether all are on the same pieces."""
+        return (
+            bool((self.hinge == other.hinge).all())
+            and (self.terminal is other.terminal or bool((self.terminal == other.terminal).all()))
+            and self.held.same_as(other.held)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,10 +162,8 @@ class Subproblem:
 
     def strictly_inside(self, e: Array) -> bool:
         """Whether no control is at its limits."""
-        inside = bool(((self.lower < e) & (e < self.upper)).all())
-        if inside and self.radius < np.inf:
-            inside = bool((np.linalg.norm(e - self.center, axis=1) < self.radius).all())
-        return inside
+        box, ball = ((self.lower < e) & (e < self.upper)).all(), self.radius == np.inf
+        return bool(box and (ball or (np.linalg.norm(e - self.center, axis=1) < self.radius).all()))
 
     def admissible(self, e: Array) -> Array:
         """The nearest deviations within bounds and balls, (K, m)."""

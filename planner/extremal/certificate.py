@@ -11,6 +11,7 @@ optimum: the maximum principle is necessary, not sufficient.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from slipcar.planner.extremal.maximum_principle import (
     adjoint_of,
     best_step,
     first_order,
+    model_for,
     scales,
     time_slope,
 )
-from slipcar.planner.extremal.planned import Planned, model_for
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import Multipliers
 from slipcar.planner.status import Status
@@ -46,6 +47,7 @@ class Violations:
     """How far a trajectory with multiplier 𝔭 is from the maximum principle, in its own units.
 
     Attributes:
+        at: first derivatives there.
         dynamics: largest |F_k(x_k, u_k) − x_{k+1}|.
         terminal: largest |g(x_K)| beyond its tolerance.
         control: largest |argmax_U H_k − u_k|, p from the adjoint recursion.
@@ -55,6 +57,7 @@ class Violations:
         scales: what counts as one.
     """
 
+    at: FirstOrder
     dynamics: float
     terminal: float
     control: float
@@ -91,30 +94,21 @@ def violations(
 ) -> Violations:
     """Measure any trajectory: an iterate of SCP, a point of the shooting method, a plan.
 
-    Args:
-        model: the problem.
-        x: states, (N, n).
-        u: controls, (K, m).
-        terminal: ν = −𝔭 of the sub-problem, (q,).
-        variance_weight: w ≥ 0.
-        terminal_tolerance: half-width of the terminal box.
+    States x (N, n), controls u (K, m) and ν = −𝔭 of the sub-problem, (q,); w ≥ 0 and half the width
+    of the terminal box.
     """
     at = first_order(model, x, u, variance_weight)
-    return _violations(model, at, terminal, terminal_tolerance)
-
-
-def _violations(model: Model, at: FirstOrder, terminal: Array, tolerance: float) -> Violations:
-    u, g = at.lin.u, at.lin.g
     adjoint = adjoint_of(at, terminal)
     e, gain = best_step(model, at, adjoint)
     return Violations(
+        at=at,
         dynamics=_largest(at.lin.defect),
-        terminal=_largest(np.maximum(np.abs(g) - tolerance, 0.0)),
+        terminal=_largest(np.maximum(np.abs(at.lin.g) - terminal_tolerance, 0.0)),
         control=_largest(e),
         hamiltonian=max(0.0, float(np.max(gain))),
         bounds=_largest(model.admissible(u) - u),
         adjoint=adjoint,
-        scales=scales(model, at, adjoint),
+        scales=scales(at, adjoint),
     )
 
 
@@ -183,28 +177,28 @@ class Certificate:
 
     def _failed(self) -> list[str]:
         """Conditions that do not hold, the worst first."""
-        excess = {}
-        for name, value in self.residuals.items():
-            limit = min(self.tolerance, _FEASIBILITY) if name in _FEASIBLE else self.tolerance
-            if not value <= limit:
-                excess[name] = np.nan_to_num(value / limit, nan=np.inf)
+        strict = min(self.tolerance, _FEASIBILITY)
+        excess = {
+            name: np.nan_to_num(value / limit, nan=np.inf)
+            for name, value in self.residuals.items()
+            if not value <= (limit := strict if name in _FEASIBLE else self.tolerance)
+        }
         return sorted(excess, key=lambda name: -excess[name])
 
     def __str__(self) -> str:
-        v = self.violations
+        v, relaxed, ended = self.violations, int(self.relaxed.sum()), f" ({self.status})"
         if self.extremal:
             verdict = f"EXTREMAL to {self.residual:.1e}: the maximum principle holds"
-        elif not self.normal:
-            verdict = "NO extremal shown: the cost's multiplier p⁰ vanishes (abnormal)"
         else:
-            worst = self._failed()[0]
-            verdict = f"NO extremal: {worst} violated by {self.residuals[worst]:.1e} of its scale"
-        relaxed = int(self.relaxed.sum())
-        advice = (
-            " (CONVERGED: ask for a smaller tolerance)" if self.status.ok else f" ({self.status})"
-        )
+            verdict = "NO extremal shown: the cost's multiplier p⁰ vanishes (abnormal)"
+            if self.normal:
+                worst = self._failed()[0]
+                size = f"{self.residuals[worst]:.1e}"
+                verdict = f"NO extremal: {worst} violated by {size} of its scale"
+            if self.status.ok:
+                ended = " (CONVERGED: ask for a smaller tolerance)"
         lines = [
-            verdict + (f" ({self.status})" if self.extremal else advice),
+            verdict + ended,
             f"  normal      min |p⁰_k| = {self.smallest_cost_multiplier:.3g} over "
             f"{len(self.cost_history)} iterations"
             + (f", {relaxed} with a relaxed terminal condition" if relaxed else ""),
@@ -221,13 +215,11 @@ class Certificate:
 
 
 @_quiet
-def certify(
-    plan: Planned, *, tolerance: float = 1e-2, time_weight: float | None = None
-) -> Certificate:
+def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = None) -> Certificate:
     """Check a plan against the maximum principle; never raises for how the plan ended.
 
     Args:
-        plan: any plan that knows its problem.
+        plan: a :class:`slipcar.planner.Plan` that knows its problem.
         tolerance: largest relative residual of an extremal (of feasibility at most 1e-4). Of
             100 random worlds 99 meet the default with `plan`'s own default stopping rule, and all
             with its `tolerance=1e-6`.
@@ -240,34 +232,32 @@ def certify(
     if not (np.isfinite(tolerance) and tolerance > 0.0):
         raise ValueError(f"tolerance must be finite and > 0, not {tolerance!r}")
     model, own, weight = model_for(plan), plan.multipliers, plan.options["variance_weight"]
-    at = first_order(model, plan.mean, plan.controls, weight)
-    broken = _violations(model, at, -own.terminal, plan.options["terminal_tolerance"])
-    adjoint = -np.vstack([at.lin.A[0].T @ broken.adjoint[0], broken.adjoint])
+    broken = violations(
+        model, plan.mean, plan.controls, -own.terminal,
+        variance_weight=weight, terminal_tolerance=plan.options["terminal_tolerance"],
+    )  # fmt: skip
+    lin = broken.at.lin
+    adjoint = -np.vstack([lin.A[0].T @ broken.adjoint[0], broken.adjoint])
     history = [
         Multipliers(-h.terminal_multiplier, -1.0, -h.trust_multiplier, own.adjoint).normalized()
         for h in plan.history
     ]
     lacking = np.array([h.virtual_control for h in plan.history])
-    slope = None
+    transversality = None
     if time_weight is not None:
-        slope = time_slope(model, at, broken.adjoint, weight) + time_weight
-    rate = (at.lin.effort + at.lin.penalty) / (model.times[-1] - model.times[0])
+        transversality = -time_slope(model, broken.at, broken.adjoint, weight) - time_weight
+    rate = (lin.effort + lin.penalty) / (model.times[-1] - model.times[0])
     return Certificate(
-        status=plan.status,
-        multipliers=own.normalized(),
-        terminal_history=np.reshape(
-            [h.terminal for h in history], (len(history), len(own.terminal))
-        ),
+        plan.status, own.normalized(),
+        terminal_history=np.reshape([h.terminal for h in history], (-1, len(own.terminal))),
         cost_history=np.array([h.cost for h in history]),
         trust_region_history=np.array([h.trust_region for h in history]),
         relaxed=lacking > _RELAXED * broken.scales.state,
-        violations=broken,
-        adjoint=adjoint,
+        violations=broken, adjoint=adjoint,
         adjoint_difference=_largest(adjoint[1:] - own.adjoint[1:]),
-        transversality=None if slope is None else -slope,
-        cost_rate=max(rate, abs(time_weight or 0.0), 1e-300),
+        transversality=transversality, cost_rate=max(rate, abs(time_weight or 0.0), 1e-300),
         tolerance=float(tolerance),
-    )
+    )  # fmt: skip
 
 
 def _largest(values: Array) -> float:

@@ -13,12 +13,11 @@ import dataclasses
 
 import numpy as np
 
-from slipcar.planner.extremal.coupling import coupled_step
+from slipcar.planner.convex.subproblem import Pieces
 from slipcar.planner.extremal.maximum_principle import FirstOrder, Scales, first_order
-from slipcar.planner.extremal.newton_step import NewtonSystem, Pieces
+from slipcar.planner.extremal.newton_step import System, coupled_step, newton_system
 from slipcar.planner.extremal.second_order import SecondOrder, second_order
 from slipcar.planner.lq.banded import PrimalDual
-from slipcar.planner.problem.control_set import project_controls
 from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
@@ -52,14 +51,7 @@ class ShootingPoint:
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """The equations to be solved.
-
-    Attributes:
-        model: the problem.
-        variance_weight: w ≥ 0.
-        tolerance: half-width of the terminal box.
-        scales: what counts as one.
-    """
+    """The equations to be solved, for w ≥ 0 and the half-width of the terminal box."""
 
     model: Model
     variance_weight: float
@@ -68,15 +60,13 @@ class Conditions:
 
     def at(self, x: Array, u: Array, adjoint: Array, terminal: Array) -> ShootingPoint:
         """Residuals at a point."""
-        model, scales = self.model, self.scales
-        gradients = first_order(model, x, u, self.variance_weight)
-        lin = gradients.lin
+        scales = self.scales
+        gradients = first_order(self.model, x, u, self.variance_weight)
+        lin, sub, slope = gradients.lin, gradients.sub, gradients.slope(adjoint)
         rest = gradients.state_gradient - adjoint
         rest[:-1] += np.matmul(adjoint[1:, None], lin.A[1:])[:, 0]
         rest[-1] += terminal @ lin.G
-        slope = gradients.slope(adjoint)
-        wanted = self._wanted(gradients.sub.R, u, slope)
-        control = u - project_controls(wanted, model.lower, model.upper, model.radius)
+        control = sub.admissible(sub.wanted(np.zeros_like(u), slope))
         end = lin.g - np.clip(self._pressed(lin.g, terminal), -self.tolerance, self.tolerance)
         parts = np.concatenate(
             [
@@ -90,80 +80,59 @@ class Conditions:
         largest = float(np.max(np.abs(parts))) if np.isfinite(norm) else np.inf
         return ShootingPoint(gradients, adjoint, terminal, slope, norm, largest)
 
-    def _wanted(self, R: Array, u: Array, slope: Array) -> Array:
-        """Where −D⁻¹ slope leads from u; its projection onto U is u at an extremal, (K, m)."""
-        diagonal = np.einsum("kii->ki", R)
-        if np.isfinite(self.model.radius):  # a projection onto a ball needs one scale per node
-            diagonal = diagonal.max(axis=1, keepdims=True)
-        return u - slope / diagonal
-
     def _pressed(self, g: Array, terminal: Array) -> Array:
         """Where ν/s leads from g; its projection onto the terminal box is g at one, (q,)."""
         return g + terminal * (self.scales.state / self.scales.adjoint)
 
     def moved(self, here: ShootingPoint, step: PrimalDual, length: float) -> ShootingPoint:
         """The point a part of the step away."""
-        lin = here.gradients.lin
-        x = lin.x.copy()
+        x, u = here.gradients.lin.x.copy(), here.gradients.lin.u + length * step.e
         x[1:] += length * step.d
-        return self.at(
-            x,
-            lin.u + length * step.e,
-            here.adjoint + length * step.adjoint,
-            here.terminal + length * step.terminal,
-        )
+        adjoint = here.adjoint + length * step.adjoint
+        return self.at(x, u, adjoint, here.terminal + length * step.terminal)
 
     def newton(self, here: ShootingPoint) -> PrimalDual | None:
         """The Newton step; None if its matrix is singular."""
         model, weight, gradients = self.model, self.variance_weight, here.gradients
         hessians = second_order(model, gradients, here.adjoint, here.terminal, weight)
-        pieces = self._pieces(here, hessians, None)
-        settled: tuple[NewtonSystem, PrimalDual] | None = None
+        pieces = self._pieces(here)
+        settled: tuple[System, PrimalDual] | None = None
         for _ in range(_PIECE_SOLVES):
-            system = NewtonSystem(
+            system = newton_system(
                 gradients, hessians, here.adjoint, here.terminal, pieces, self.tolerance
             )
-            step = system.solve() if system.regular else None
-            if step is None:
+            step = None if system is None else system(np.zeros_like(here.adjoint))
+            if system is None or step is None:
                 break  # with so many controls held, the end is out of reach
             settled = system, step
             reached = self._pieces(here, hessians, step)
-            if reached.same(pieces):
+            if reached.same_as(pieces):
                 break
             pieces = reached
-        if settled is None:
-            return None
-        system, step = settled
-        if gradients.weights is None:
-            return step
+        if settled is None or gradients.weights is None:
+            return None if settled is None else settled[1]
         # As exact as the residual is small: quadratic convergence, and no more work.
         small = min(here.largest, 1.0)
         enough = _COUPLING_PART * small * small * self.scales.adjoint
-        return coupled_step(model, gradients, hessians, system, step, weight, enough)
+        return coupled_step(model, gradients, hessians, *settled, weight, enough)
 
     def _pieces(
-        self, here: ShootingPoint, hessians: SecondOrder, step: PrimalDual | None
+        self,
+        here: ShootingPoint,
+        hessians: SecondOrder | None = None,
+        step: PrimalDual | None = None,
     ) -> Pieces:
         """The pieces at a point, or those a step leads to by the linearised conditions."""
-        model, sub = self.model, here.gradients.sub
-        c, g, u, slope, terminal = sub.b, sub.g, here.gradients.lin.u, here.slope, here.terminal
-        if step is not None:
-            c = sub.hinge_arguments(step.d)
-            g, u, terminal = g + sub.G @ step.d[-1], u + step.e, terminal + step.terminal
+        sub, slope, terminal = here.gradients.sub, here.slope, here.terminal
+        c, g, e = sub.b, sub.g, np.zeros_like(slope)
+        if hessians is not None and step is not None:
+            c, e = sub.hinge_arguments(step.d), step.e
+            g, terminal = g + sub.G @ step.d[-1], terminal + step.terminal
             slope = slope + np.matmul(step.adjoint[:, None], sub.B)[:, 0]
-            slope += np.matmul(hessians.uu, step.e[..., None])[..., 0]
+            slope += np.matmul(hessians.uu, e[..., None])[..., 0]
             slope[1:] += np.matmul(hessians.ux[1:], step.d[:-1, :, None])[..., 0]
-        wanted = self._wanted(sub.R, u, slope)
-        ball = np.zeros(len(u), dtype=bool)
-        if np.isfinite(model.radius):
-            inside = np.clip(wanted, model.lower, model.upper)
-            ball = np.linalg.norm(inside, axis=1) > model.radius
-        pressed = self._pressed(g, terminal)
-        side = np.where(np.abs(pressed) > self.tolerance, np.sign(pressed), 0.0)
-        return Pieces(
-            hinge=c > 0.0,
-            lower=wanted < model.lower,
-            upper=wanted > model.upper,
-            ball=ball,
-            terminal=side if self.tolerance > 0.0 else np.ones(len(sub.g)),
-        )
+        side = np.ones(len(g))
+        if self.tolerance > 0.0:
+            pressed = self._pressed(g, terminal)
+            side = np.where(np.abs(pressed) > self.tolerance, np.sign(pressed), 0.0)
+        return Pieces(c > 0.0, side, sub.held(e, slope))

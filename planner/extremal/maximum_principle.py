@@ -10,8 +10,8 @@ extremal with multiplier 𝔭 if
 
 Which variance is meant: w ∫ tr Σ dt = w Σ dt tr(Λ_{k+1} σ_k σ_kᵀ), and the adjoint equation
 holds Λ (so ∂A/∂x is not differentiated), as every sub-problem does. This is the maximum principle
-that accumulation points of the iteration satisfy; :func:`held_variance_gradient` gives the term
-that is left out.
+that accumulation points of the iteration satisfy; what is left out, the gradient
+∂/∂A_k = 2 w Λ_{k+1} A_k Σ_k through A, is small.
 
 All gradients are those of a sub-problem at zero deviation: costs are defined in one place.
 """
@@ -19,15 +19,31 @@ All gradients are those of a sub-problem at zero deviation: costs are defined in
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from slipcar.planner.convex.subproblem import Subproblem, convexify
+from slipcar.planner.convex.subproblem import Subproblem, convexify, variance_of
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.problem.linearization import Linearization, linearize
-from slipcar.planner.problem.model import Model
+from slipcar.planner.problem.model import Model, model_of
 
 Array = np.ndarray
+
+
+def model_for(plan: Any) -> Model:
+    """The completed problem of a :class:`slipcar.planner.Plan`, with its integrator.
+
+    Raises:
+        ValueError: if the plan does not know its problem.
+    """
+    if plan.problem is None:
+        raise ValueError(
+            "this plan does not know its problem (it was loaded from a file that could not keep "
+            "it), and this needs its dynamics: plan.replace(problem=...) first"
+        )
+    model = model_of(plan.problem)
+    return dataclasses.replace(model, integrator=plan.options.get("integrator", model.integrator))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,33 +71,18 @@ class FirstOrder:
         return self.sub.q + np.matmul(self.push[:, None], self.sub.a)[:, 0]
 
     def slope(self, adjoint: Array) -> Array:
-        """Gradient of cost and dynamics with respect to u, B_kᵀ λ_{k+1} + ∇(dt uᵀRu), (K, m).
-
-        Args:
-            adjoint: λ_1..λ_K = −p_1..−p_K, (K, n).
-        """
+        """Gradient by u of cost and dynamics, B_kᵀ λ_{k+1} + ..., for λ_1..λ_K (K, n): (K, m)."""
         return self.sub.r + np.matmul(adjoint[:, None], self.sub.B)[:, 0]
 
 
 def first_order(
     model: Model, x: Array, u: Array, variance_weight: float, weights: Array | None = None
 ) -> FirstOrder:
-    """Linearise along x (N, n), u (K, m).
-
-    Args:
-        model: the problem.
-        x: states.
-        u: controls.
-        variance_weight: w ≥ 0.
-        weights: Λ to hold; by default that of this trajectory.
-    """
+    """Linearise along x (N, n), u (K, m); Λ is that of this trajectory unless `weights` hold it."""
     lin = linearize(model, x, u)
-    variance = None
-    if variance_weight > 0.0:
-        d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], x[:-1]))
-        if weights is None:
-            weights = moments.adjoint_weights(lin.A, model.dt)
-        variance = moments.variance_penalty(variance_weight, lin.sigma, d_sigma, weights, model.dt)
+    if variance_weight > 0.0 and weights is None:
+        weights = moments.adjoint_weights(lin.A, model.dt)
+    variance = variance_of(model, lin, variance_weight, weights)
     return FirstOrder(lin, weights, convexify(model, lin, variance=variance))
 
 
@@ -96,15 +97,10 @@ def adjoint_of(at: FirstOrder, terminal: Array) -> Array:
 
 
 def best_step(model: Model, at: FirstOrder, adjoint: Array) -> tuple[Array, Array]:
-    """From u to argmax_U H, and what that gains in H: (K, m) and (K,).
+    """From u to argmax_U H for λ_1..λ_K (K, n), and what that gains in H: (K, m) and (K,).
 
     H is quadratic in u for dynamics affine in it; otherwise this is its quadratic model at u,
     whose argmax is u itself exactly when u is stationary for H.
-
-    Args:
-        model: the problem.
-        at: first derivatives at the trajectory.
-        adjoint: λ_1..λ_K, (K, n).
     """
     slope = at.slope(adjoint)
     e = minimize_over_controls(model, at.sub.R, slope, at.lin.u)
@@ -113,37 +109,24 @@ def best_step(model: Model, at: FirstOrder, adjoint: Array) -> tuple[Array, Arra
 
 
 def minimize_over_controls(model: Model, R: Array, r: Array, u: Array) -> Array:
-    """The e of least ½ eᵀRe + rᵀe over u + e ∈ U, for every row: (K, m).
+    """The e (K, m) of least ½ eᵀRe + rᵀe over u + e ∈ U, for every row; R (K, m, m), r, u (K, m).
 
-    The multiplier κ ≥ 0 of the ball adds ½ κ ‖u + e‖², whose norm falls as κ grows: bisection.
-
-    Args:
-        model: whose `lower`, `upper` and `radius` are U.
-        R: (K, m, m), positive definite.
-        r: (K, m).
-        u: (K, m).
+    A part θ of ½ ‖u + e‖² in the cost, 1 − θ of the rest, pulls into the ball: bisection on θ.
     """
     lower, upper = model.lower - u, model.upper - u
     e = _minimize_over_box(R, r, lower, upper)
-    if not np.isfinite(model.radius):
-        return e
     out = np.linalg.norm(u + e, axis=1) > model.radius
     if not out.any():
         return e
     R, r, u, lower, upper = R[out], r[out], u[out], lower[out], upper[out]
-    eye = np.eye(u.shape[1])
+    scale, eye = np.einsum("kii->k", R), np.eye(u.shape[1])
 
-    def pulled(kappa: Array) -> Array:
-        bent = R + kappa[:, None, None] * eye
-        return _minimize_over_box(bent, r + kappa[:, None] * u, lower, upper)
+    def pulled(theta: Array) -> Array:
+        kept, pull = 1.0 - theta, theta * scale
+        bent = kept[:, None, None] * R + pull[:, None, None] * eye
+        return _minimize_over_box(bent, kept[:, None] * r + pull[:, None] * u, lower, upper)
 
-    # Where the box alone would go, ‖R e + r‖ pulls: a few times that keeps anything inside.
-    low, high = np.zeros(len(u)), np.einsum("kii->k", R)
-    for _ in range(200):
-        long = np.linalg.norm(u + pulled(high), axis=1) > model.radius
-        if not long.any():
-            break
-        high = np.where(long, 4.0 * high, high)
+    low, high = np.zeros(len(u)), np.ones(len(u))
     for _ in range(60):
         middle = 0.5 * (low + high)
         long = np.linalg.norm(u + pulled(middle), axis=1) > model.radius
@@ -175,39 +158,27 @@ class Scales:
         state: 1 + max |x|, for defects and the terminal residual.
         control: max |u|; at least what moves the state by 1e-3 of its scale over the horizon.
         adjoint: max |λ|; at least what such a control would answer to.
-        hamiltonian: ‖R‖ times the control's scale squared.
     """
 
     state: float
     control: float
     adjoint: float
-    hamiltonian: float
 
 
-def scales(model: Model, at: FirstOrder, adjoint: Array) -> Scales:
+def scales(at: FirstOrder, adjoint: Array) -> Scales:
     """Natural scales at a trajectory and its adjoint λ (K, n)."""
     state = 1.0 + float(np.max(np.abs(at.lin.x)))
     reach = np.abs(at.lin.B)
     control = 1e-3 * state / max(float(np.max(reach.sum(axis=0))), 1e-300)
     answer = float(np.max(np.abs(at.sub.R))) * control / max(float(reach.max()), 1e-300)
     control = max(float(np.max(np.abs(at.lin.u))), control)
-    return Scales(
-        state=state,
-        control=control,
-        adjoint=max(float(np.max(np.abs(adjoint))), answer),
-        hamiltonian=float(np.max(np.abs(model.R))) * control * control,
-    )
+    return Scales(state, control, max(float(np.max(np.abs(adjoint))), answer))
 
 
 def hamiltonian(model: Model, t: Array, x: Array, p: Array, u: Array) -> Array:
-    """H up to what does not depend on u: pᵀb(t, x, u) − uᵀRu, batched over leading axes.
+    """H up to what does not depend on u, pᵀb(t, x, u) − uᵀRu, batched over leading axes.
 
-    Args:
-        model: the problem.
-        t: times, (...,).
-        x: states, (..., n).
-        p: adjoints at the end of the interval, p⁰ = −1, (..., n).
-        u: controls, (..., m).
+    p (..., n) are the adjoints at the ends of the intervals, p⁰ = −1.
     """
     batch = np.broadcast_shapes(np.shape(t), x.shape[:-1], u.shape[:-1])
     t, u = np.broadcast_to(t, batch), np.broadcast_to(u, (*batch, u.shape[-1]))
@@ -218,15 +189,9 @@ def hamiltonian(model: Model, t: Array, x: Array, p: Array, u: Array) -> Array:
 def time_slope(model: Model, at: FirstOrder, adjoint: Array, variance_weight: float) -> float:
     """∂/∂T of the Lagrangian, −max_U H(T) of the paper's transversality condition (Theorem 5.1).
 
-    The time grid is stretched about its beginning, x, u and λ being held: by the envelope theorem
-    this is how the optimal cost changes with the horizon. (A and Λ of the variance follow the
-    grid: only their change with x is left out, as everywhere.)
-
-    Args:
-        model: the problem.
-        at: first derivatives at the trajectory.
-        adjoint: λ_1..λ_K, (K, n).
-        variance_weight: w ≥ 0.
+    The time grid is stretched about its beginning, x, u and λ_1..λ_K (K, n) being held: by the
+    envelope theorem this is how the optimal cost changes with the horizon. (A and Λ of the
+    variance follow the grid: only their change with x is left out, as everywhere.)
     """
     begin, horizon = model.times[0], model.times[-1] - model.times[0]
     step = 1e-5
@@ -243,24 +208,3 @@ def time_slope(model: Model, at: FirstOrder, adjoint: Array, variance_weight: fl
         return value
 
     return (lagrangian(1.0 + step) - lagrangian(1.0 - step)) / (2.0 * step * horizon)
-
-
-def held_variance_gradient(at: FirstOrder, A_x: Array, S: Array, variance_weight: float) -> Array:
-    """What the adjoint equation leaves out by holding Λ: the gradient of w ∫ tr Σ through A.
-
-        ∂/∂A_k of w Σ dt tr Σ_k  =  2 w Λ_{k+1} A_k Σ_k
-
-    Args:
-        at: first derivatives, with Λ.
-        A_x: ∂A_k/∂x_k, (K, n, n, n), of :mod:`.second_order`.
-        S: Σ at every node, (N, n, n).
-        variance_weight: w ≥ 0.
-
-    Returns:
-        At nodes 1..K (zero at the last, which drives nothing), (K, n).
-    """
-    gradient = np.zeros_like(at.lin.defect)
-    if at.weights is not None:
-        force = 2.0 * variance_weight * at.weights @ at.lin.A @ S[:-1]
-        gradient[:-1] = np.einsum("kab,kabi->ki", force, A_x)[1:]
-    return gradient

@@ -6,7 +6,7 @@ the trajectory are strung together into one long one, and the model is called on
 
 Central differences of exact gradients leave a relative error of 1e-10. In a Newton matrix that
 is as good as none: it changes how fast the last digits come, not where they end. And they ask
-nothing of the model: not that its Jacobians let complex arrays pass, nor that it is smooth.
+nothing of the model: not that it can be traced, nor that it is smooth.
 """
 
 from __future__ import annotations
@@ -44,66 +44,49 @@ class SecondOrder:
 
 
 def second_order(
-    model: Model,
-    here: FirstOrder,
-    adjoint: Array,
-    terminal: Array,
-    variance_weight: float,
+    model: Model, here: FirstOrder, adjoint: Array, terminal: Array, variance_weight: float
 ) -> SecondOrder:
     """Hessians at a trajectory with λ_1..λ_K (K, n) and ν (q,)."""
-    x, u, weights, push = here.lin.x, here.lin.u, here.weights, here.push
-    (N, n), (K, m) = x.shape, u.shape
-    # Euler's step is affine in u, as the drift is: nothing to be learnt by shifting it.
-    moved = 0 if model.integrator == "euler" else m
-    steps = _STEP * (1.0 + np.concatenate([np.abs(x).max(axis=0), np.abs(u).max(axis=0)]))
-    copies = 2 * (n + moved)
-    X = np.broadcast_to(x, (copies, N, n)).copy()
-    U = np.zeros((copies, N, m))  # a filler after each copy's last control
-    U[:, :K] = u
-    for i in range(n):
-        X[2 * i, :, i] += steps[i]
-        X[2 * i + 1, :, i] -= steps[i]
-    for j in range(n, n + moved):
-        U[2 * j, :K, j - n] += steps[j]
-        U[2 * j + 1, :K, j - n] -= steps[j]
-    if weights is not None:
-        repeated = np.zeros((copies, N, n, n))
-        repeated[:, :K] = weights
-        weights = repeated.reshape(-1, n, n)[:-1]
-    filler = model.dt[-1:]
-    chain = dataclasses.replace(
-        model,
-        times=np.tile(model.times, copies),
-        dt=np.tile(np.concatenate([model.dt, filler]), copies)[:-1],
-    )
-    u = U.reshape(-1, m)[:-1]
-    at = first_order(chain, X.reshape(-1, n), u, variance_weight, weights)
+    x, u = here.lin.x, here.lin.u
+    (N, n), K = x.shape, len(u)
+    steps = np.diag(_STEP * (1.0 + np.concatenate([np.abs(z).max(axis=0) for z in (x, u)])))
+    if model.integrator == "euler":  # affine in u, as the drift is: nothing to be learnt there
+        steps = steps[:n]
+    shifts = np.concatenate([steps, -steps])
+
+    def strung(values: Array) -> Array:
+        """Of every interval, (K, ...), once for each copy, an interval of no length between."""
+        whole = np.concatenate([values, np.zeros_like(values[:1])])
+        return np.concatenate([whole] * len(shifts))[:-1]
 
     def parts(values: Array) -> Array:
-        """(copies · N − 1, ...) -> (copies, K, ...)."""
+        """The other way round: (copies · N − 1, ...) -> (copies, K, ...)."""
         whole = np.concatenate([values, values[-1:]])
-        return whole.reshape(copies, N, *values.shape[1:])[:, :K]
+        return whole.reshape(len(shifts), N, *values.shape[1:])[:, :K]
 
+    def derivatives(values: Array) -> Array:
+        """By the components that copies shift, as a last axis, from (copies, ...)."""
+        ahead, back = values[: len(steps)], values[len(steps) :]
+        return np.moveaxis(ahead - back, 0, -1) * (0.5 / steps.diagonal())
+
+    chain = dataclasses.replace(model, times=np.tile(model.times, len(shifts)), dt=strung(model.dt))
+    X = x + shifts[:, None, :n]
+    U = strung(u) + np.repeat(shifts[:, n:], N, axis=0)[:-1]
+    weights = None if here.weights is None else strung(here.weights)
+    at = first_order(chain, X.reshape(-1, n), U, variance_weight, weights)
     A, B = parts(at.lin.A), parts(at.lin.B)
     # Nodes 1..K; the hinges' own square stays out: its pieces are for the Newton step to choose.
-    by_state = parts(at.sub.q) + np.einsum("kp,ckpn->ckn", push, parts(at.sub.a))
+    by_state = parts(at.sub.q) + np.einsum("kp,ckpn->ckn", here.push, parts(at.sub.a))
     by_state[:, :-1] += np.einsum("kj,ckji->cki", adjoint[1:], A[:, 1:])
     G = np.asarray(model.terminal_jacobian(X[:, -1]))
     by_state[:, -1] += np.einsum("q,cqi->ci", terminal, G)
-    by_control = parts(at.sub.r) + np.einsum("kj,ckji->cki", adjoint, B)
-
-    def derivative(values: Array, begin: int, count: int) -> Array:
-        """Differences over the copies that shift these components, as a last axis."""
-        chosen = values[2 * begin : 2 * (begin + count)]
-        scale = 0.5 / steps[begin : begin + count]
-        return np.moveaxis(chosen[::2] - chosen[1::2], 0, -1) * scale
-
-    xx = derivative(by_state, 0, n)
-    uu = derivative(by_control, n, m) if moved else here.sub.R
+    by_control = derivatives(parts(at.sub.r) + np.einsum("kj,ckji->cki", adjoint, B))
+    xx = derivatives(by_state)[..., :n]
+    uu = by_control[..., n:] if len(steps) > n else here.sub.R
     return SecondOrder(
         xx=0.5 * (xx + xx.swapaxes(1, 2)),
-        ux=derivative(by_control, 0, n),
+        ux=by_control[..., :n],
         uu=0.5 * (uu + uu.swapaxes(1, 2)),
-        A_x=derivative(A, 0, n),
-        A_u=derivative(B, 0, n).swapaxes(-1, -2),  # ∂²F/∂x∂u, either way round
+        A_x=derivatives(A)[..., :n],
+        A_u=derivatives(B)[..., :n].swapaxes(-1, -2),  # ∂²F/∂x∂u, either way round
     )

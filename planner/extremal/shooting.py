@@ -20,22 +20,22 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from slipcar.planner.extremal.conditions import Conditions, ShootingPoint
-from slipcar.planner.extremal.maximum_principle import adjoint_of, first_order, scales
-from slipcar.planner.extremal.planned import Planned, model_for
+from slipcar.planner.extremal.maximum_principle import (
+    adjoint_of,
+    first_order,
+    model_for,
+    scales,
+)
 from slipcar.planner.lq.banded import PrimalDual
-from slipcar.planner.moments import covariance as moments
-from slipcar.planner.problem.linearization import Linearization
+from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model
-from slipcar.planner.records import Multipliers
-from slipcar.planner.status import Status
 
 Array = np.ndarray
-P = TypeVar("P", bound=Planned)
 
 #: Where to start. Of 150 random worlds with turned headings (w = 1), 148 lead to a shot that
 #: converges when it is tried at a residual of 0.2 and again whenever that has halved, 1.1 times
@@ -143,8 +143,7 @@ def shoot(
     start = first_order(model, x, u, variance_weight)
     if adjoint is None:
         adjoint = adjoint_of(start, terminal)
-    sizes = scales(model, start, adjoint)
-    conditions = Conditions(model, variance_weight, terminal_tolerance, sizes)
+    conditions = Conditions(model, variance_weight, terminal_tolerance, scales(start, adjoint))
     here = conditions.at(x, u, adjoint, terminal)
     history = [_row(here, 0.0, began)]
     attempted = here.largest <= start_within
@@ -161,19 +160,13 @@ def shoot(
         else:
             here, length = there
             history.append(_row(here, length, began))
-    u = here.gradients.lin.u
-    inside = model.admissible(u)  # they pass their bounds by rounding errors
-    if message == "converged" and (inside != u).any():
-        here = conditions.at(here.gradients.lin.x, inside, here.adjoint, here.terminal)
+    lin, converged = here.gradients.lin, message == "converged"
+    inside = model.admissible(lin.u)  # they pass their bounds by rounding errors
+    if converged and (inside != lin.u).any():
+        lin = linearize(model, lin.x, inside)
+    seconds = time.perf_counter() - began
     return Shot(
-        converged=message == "converged",
-        at=here.gradients.lin,
-        adjoint=here.adjoint,
-        terminal=here.terminal,
-        history=tuple(history),
-        seconds=time.perf_counter() - began,
-        attempted=attempted,
-        message=message,
+        converged, lin, here.adjoint, here.terminal, tuple(history), seconds, attempted, message
     )
 
 
@@ -196,22 +189,17 @@ def _row(here: ShootingPoint, step: float, began: float) -> ShotIteration:
 
 
 def retry_within(shot: Shot, limit: float) -> float:
-    """Residual at which to shoot again: where this attempt was not even made, the same one.
+    """Residual at which to shoot again, after a shot within `limit` that did not converge.
 
-    Args:
-        shot: that did not converge.
-        limit: what it was started within.
+    Where this attempt was not even made, it is the same one.
     """
     return min(limit, _RETRY * shot.history[0].residual) if shot.attempted else limit
 
 
-def shoot_from(plan: Planned, iteration: int | None = None, **options: Any) -> Shot:
-    """Shoot from an iteration of a plan's history.
+def shoot_from(plan: Any, iteration: int | None = None, **options: Any) -> Shot:
+    """Shoot from an iteration of a plan's history, None from the plan itself.
 
-    Args:
-        plan: a plan that knows its problem.
-        iteration: index into `plan.history`; None takes the plan itself.
-        **options: `tolerance`, `max_iterations`, `start_within` of :func:`shoot`.
+    `options` are `tolerance`, `max_iterations`, `start_within` of :func:`shoot`.
 
     Raises:
         ValueError: if the plan does not know its problem.
@@ -225,31 +213,3 @@ def shoot_from(plan: Planned, iteration: int | None = None, **options: Any) -> S
     options.setdefault("variance_weight", plan.options["variance_weight"])
     options.setdefault("terminal_tolerance", plan.options["terminal_tolerance"])
     return shoot(model, x, u, terminal, **options)
-
-
-def improved(plan: P, shot: Shot) -> P:
-    """The plan with a converged shot's trajectory and multipliers in place of its own.
-
-    Raises:
-        ValueError: if the shot did not converge.
-    """
-    if not shot.converged:
-        raise ValueError(f"this shot did not converge ({shot.message}): it improves nothing")
-    at, dt = shot.at, np.diff(plan.times)
-    S = moments.covariance_of(model_for(plan), at)
-    return plan.replace(
-        status=Status.CONVERGED,
-        mean=at.x,
-        controls=at.u,
-        covariance=S,
-        effort=at.effort,
-        obstacle_cost=at.penalty,
-        running_cost=at.running,
-        variance=moments.trace_integral(S, dt),
-        multipliers=Multipliers.of(shot.adjoint, shot.terminal, 0.0, at.A),
-        A=at.A,
-        B=at.B,
-        gains=None,
-        solve_time=plan.solve_time + shot.seconds,
-        message="",
-    )

@@ -219,7 +219,7 @@ class Workspace:
 
     def view(self, name: str) -> Any:
         """The numbers of an array that has one row."""
-        return memoryview(self.arrays[name].reshape(-1))
+        return self.arrays[name].reshape(-1).data
 
     def at(self, side: int, name: str) -> Array:
         """What a kernel on that side calls `name`, (K + 1, ...) or (1, ...)."""

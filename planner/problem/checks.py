@@ -189,12 +189,13 @@ def check_given(model: Model, x: Array, u: Array) -> None:
     exact = Jacobians(model.problem, model.state_dim, model.control_dim, given=False)
     t, y, v = _points(model, x, u)
     pairs: list[tuple[str, Any, Any]] = []
+    both: Any
     if model.jacobians.is_given("drift"):
         both = zip(model.jacobians.drift(t, y, v), exact.drift(t, y, v), strict=True)
         pairs += [(f"drift_jacobian[{i}]", *pair) for i, pair in enumerate(both)]
     for name in ("diffusion", "penalty", "control_cost", "terminal"):
         if model.has(name) and model.jacobians.is_given(name):
-            slopes = (j.state(name, t, y) for j in (model.jacobians, exact))
+            slopes = model.jacobians.state(name, t, y), exact.state(name, t, y)
             pairs.append((f"{name}_jacobian", *slopes))
     if model.jacobians.is_given("state_cost"):
         both = zip(model.jacobians.state_cost(t, y), exact.state_cost(t, y), strict=True)

@@ -7,142 +7,100 @@ rounding wherever the code that was traced is finite; the sign of a zero may get
 
 from __future__ import annotations
 
-import math
 from typing import Any
-
-import numpy as np
 
 from slipcar.planner.trace.errors import TraceError
 
 Expression = Any  # graph.Expression, which is built on this module
 
-#: Values of the operations that are not operators; NumPy's functions of the same name but these.
-_VALUES: dict[str, Any] = {"erfc": math.erfc, "abs": abs}
 
-
-def _value(op: str, *numbers: float) -> float:
-    with np.errstate(all="ignore"):
-        return float((_VALUES.get(op) or getattr(np, op))(*numbers))
+def call(name: str, *args: Expression) -> Expression:
+    """An operation by its name, as it is."""
+    return args[0].graph.make(name, args)
 
 
 def _is(a: Expression, number: float) -> bool:
     return a.op == "constant" and a.value == number
 
 
+def _is_number(a: Expression) -> bool:
+    return a.op == "constant" or (a.op == "input" and a.value[0] == "number")
+
+
 def add(a: Expression, b: Expression) -> Expression:
     """The sum a + b."""
-    if a.op == "constant":
-        if b.op == "constant":
-            return a.graph.constant(a.value + b.value)
-        if a.value == 0.0:
-            return b
-    elif b.op == "constant" and b.value == 0.0:
+    if a.op == "constant" and a.value == 0.0:
+        return b
+    if b.op == "constant" and b.value == 0.0:
         return a
     if b.op == "neg":
         return sub(a, b.args[0])
     if a.op == "neg":
         return sub(b, a.args[0])
-    if a.index > b.index:  # a sum is recognised whichever way round it is written
-        a, b = b, a
-    return a.graph.make("add", (a, b))
+    # A sum is recognised whichever way round it is written.
+    return a.graph.make("add", (a, b) if a.index < b.index else (b, a))
 
 
 def sub(a: Expression, b: Expression) -> Expression:
     """The difference a − b."""
-    if b.op == "constant":
-        if a.op == "constant":
-            return a.graph.constant(a.value - b.value)
-        if b.value == 0.0:
-            return a
-    elif a.op == "constant" and a.value == 0.0:
+    if b.op == "constant" and b.value == 0.0:
+        return a
+    if a.op == "constant" and a.value == 0.0:
         return neg(b)
     if a is b:
         return a.graph.constant(0.0)
-    if b.op == "neg":
-        return add(a, b.args[0])
-    return a.graph.make("sub", (a, b))
+    return add(a, b.args[0]) if b.op == "neg" else a.graph.make("sub", (a, b))
 
 
 def neg(a: Expression) -> Expression:
     """The opposite −a."""
-    if a.op == "constant":
-        return a.graph.constant(-a.value)
-    if a.op == "neg":
-        return a.args[0]
-    return a.graph.make("neg", (a,))
+    return a.args[0] if a.op == "neg" else a.graph.make("neg", (a,))
 
 
 def mul(a: Expression, b: Expression) -> Expression:
     """The product a b."""
     if a.op == "constant":
-        if b.op == "constant":
-            return a.graph.constant(a.value * b.value)
         a, b = b, a
-    if b.op == "constant":
-        if b.value == 0.0:
-            return b
-        if b.value == 1.0:
-            return a
-        if b.value == -1.0:
-            return neg(a)
+    if b.op == "constant" and b.value in (0.0, 1.0, -1.0):
+        return b if b.value == 0.0 else a if b.value == 1.0 else neg(a)
     if a.op == "neg":
         return neg(mul(a.args[0], b))
     if b.op == "neg":
         return neg(mul(a, b.args[0]))
-    if a.index > b.index:
-        a, b = b, a
-    return a.graph.make("mul", (a, b))
+    return a.graph.make("mul", (a, b) if a.index < b.index else (b, a))
 
 
 def div(a: Expression, b: Expression) -> Expression:
-    """The quotient a / b.
-
-    Raises:
-        TraceError: if b is the number zero.
-    """
-    if b.op == "constant":
+    """The quotient a / b; a TraceError if b is the number zero."""
+    if b.op == "constant" and b.value in (0.0, 1.0, -1.0):
         if b.value == 0.0:
             raise TraceError("a division by the number zero", "a division by zero")
-        if a.op == "constant":
-            return a.graph.constant(a.value / b.value)
-        if b.value == 1.0:
-            return a
-        if b.value == -1.0:
-            return neg(a)
-    elif a.op == "constant" and a.value == 0.0:
+        return a if b.value == 1.0 else neg(a)
+    if a.op == "constant" and a.value == 0.0:
         return a
     if a.op == "neg":
         return neg(div(a.args[0], b))
-    if b.op == "neg":
-        return neg(div(a, b.args[0]))
-    return a.graph.make("div", (a, b))
+    return neg(div(a, b.args[0])) if b.op == "neg" else a.graph.make("div", (a, b))
 
 
 def power(a: Expression, b: Expression) -> Expression:
     """The power a ** b; products where b is a whole constant, √ where it is one half."""
     if a.op == "constant" or b.op != "constant":
         return call("power", a, b)
-    exponent = b.value
+    exponent, constant = b.value, a.graph.constant
     if exponent == 0.5:
         return sqrt(a)
     if exponent.is_integer() and abs(exponent) <= 16:
-        result, base, left = a.graph.constant(1.0), a, int(abs(exponent))
+        result, base, left = constant(1.0), a, int(abs(exponent))
         while left:
             if left & 1:
                 result = mul(result, base)
             base, left = mul(base, base), left >> 1
-        return result if exponent >= 0 else div(a.graph.constant(1.0), result)
+        return result if exponent >= 0 else div(constant(1.0), result)
     if 0.0 < exponent <= 16 and (2.0 * exponent).is_integer() and vanishes_flat(a):
         # a is not negative, and its derivatives at 0 are those of a product.
-        return mul(power(a, a.graph.constant(exponent - 0.5)), sqrt(a))
+        return mul(power(a, constant(exponent - 0.5)), sqrt(a))
     return call("power", a, b)
-
-
-def call(name: str, *args: Expression) -> Expression:
-    """A function by NumPy's name (and erfc); computed if its arguments are constants."""
-    if all(a.op == "constant" for a in args):
-        return args[0].graph.constant(_value(name, *(a.value for a in args)))
-    return args[0].graph.make(name, args)
 
 
 def sqrt(a: Expression) -> Expression:
@@ -161,23 +119,14 @@ def absolute(a: Expression) -> Expression:
     return call("abs", a)
 
 
-def _constant_last(a: Expression, b: Expression) -> tuple[Expression, Expression]:
-    """Two operands, a constant or a number second: its derivative counts where they are equal."""
-    fixed = a.op == "constant" or (a.op == "input" and a.value[0] == "number")
-    return (b, a) if fixed else (a, b)
-
-
-def maximum(a: Expression, b: Expression) -> Expression:
-    """The larger of two; not a number if one of them is none."""
-    return a if a is b else call("maximum", *_constant_last(a, b))
+def maximum(a: Expression, b: Expression, name: str = "maximum") -> Expression:
+    """The larger of two; where they are equal its slope is that of the number or the second."""
+    return a if a is b else call(name, b, a) if _is_number(a) else call(name, a, b)
 
 
 def minimum(a: Expression, b: Expression) -> Expression:
-    """The smaller of two; not a number if one of them is none."""
-    return a if a is b else call("minimum", *_constant_last(a, b))
-
-
-# ------------------------------------------------------------------------------ conditions
+    """The smaller of two; as `maximum`."""
+    return maximum(a, b, "minimum")
 
 
 def greater(a: Expression, b: Expression) -> Expression:
@@ -185,29 +134,20 @@ def greater(a: Expression, b: Expression) -> Expression:
     return a.graph.constant(0.0) if a is b else call("greater", a, b)
 
 
-def greater_equal(a: Expression, b: Expression) -> Expression:
-    """Whether a ≥ b."""
-    return call("greater_equal", a, b)
-
-
 def equal(a: Expression, b: Expression) -> Expression:
     """Whether a = b."""
-    if a.index > b.index:
-        a, b = b, a
-    return call("equal", a, b)
+    return call("equal", a, b) if a.index < b.index else call("equal", b, a)
 
 
 def is_condition(a: Expression) -> bool:
     """Whether an expression is made as a condition: of comparisons, and, or, not."""
     if a.op in ("greater", "greater_equal", "equal"):
         return True
-    if a.op == "constant":
-        return a.value in (0.0, 1.0)
     if a.op in ("mul", "maximum", "minimum"):
         return is_condition(a.args[0]) and is_condition(a.args[1])
     if a.op == "sub":
         return _is(a.args[0], 1.0) and is_condition(a.args[1])
-    return False
+    return _is(a, 0.0) or _is(a, 1.0)
 
 
 def truth(a: Expression) -> Expression:
@@ -235,17 +175,12 @@ def where(c: Expression, a: Expression, b: Expression) -> Expression:
     return c.graph.make("where", (c, a, b))
 
 
-# --------------------------------------------------------------------------- kinks of roots
-
-
 def vanishes_flat(a: Expression) -> bool:
     """Whether a is nowhere negative, and its derivative (as we define it) is 0 where a is 0.
 
     So it is for sums of squares, absolute values and max(0, ·). The derivative of a root of such
     is taken as 0 at its kink, one of its subgradients, where the formula would give 0/0.
     """
-    if a.op in ("abs", "hypot"):
-        return True
     if a.op == "add":
         return vanishes_flat(a.args[0]) and vanishes_flat(a.args[1])
     if a.op in ("div", "sqrt"):
@@ -254,7 +189,7 @@ def vanishes_flat(a: Expression) -> bool:
         return _is(a.args[1], 0.0)
     if a.op == "where":
         return a.args[1].is_zero or a.args[2].is_zero
-    return a.op == "mul" and _is_square(a)
+    return a.op in ("abs", "hypot") or (a.op == "mul" and _is_square(a))
 
 
 def _is_square(product: Expression) -> bool:
@@ -265,13 +200,12 @@ def _is_square(product: Expression) -> bool:
         a = stack.pop()
         if a.op == "mul":
             stack.extend(a.args)
-        elif a.op == "constant" or (a.op == "input" and a.value[0] == "number"):
-            continue
-        elif odd.pop(a.index, None) is None:
-            odd[a.index] = a
-        else:
+        elif a.index in odd:
             squares = True
-    return (squares or bool(odd)) and all(vanishes_flat(a) for a in odd.values())
+            del odd[a.index]
+        elif not _is_number(a):
+            odd[a.index] = a
+    return (squares or bool(odd)) and all(map(vanishes_flat, odd.values()))
 
 
 def nonzero(a: Expression) -> Expression:

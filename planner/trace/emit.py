@@ -13,108 +13,77 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from slipcar.planner.trace.graph import Expression, Graph
+from slipcar.planner.trace.derivatives import OPERATIONS
+from slipcar.planner.trace.graph import Expression, Graph, reachable
 from slipcar.planner.trace.recursion import Layout, Recursion, SymbolRows, pack
-
-_OPERATORS = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
-_COMPARISONS = {"greater": "ogt", "greater_equal": "oge", "equal": "oeq"}
-_INTRINSICS = {
-    **{name: name for name in ("sin", "cos", "exp", "log", "sqrt", "floor", "exp2", "log2", "log10")},
-    "abs": "fabs",
-    "minimum": "minimum",
-    "maximum": "maximum",
-}  # fmt: skip
-#: NumPy's names where the C library's differ.
-_C_NAMES = {
-    "arcsin": "asin", "arccos": "acos", "arctan": "atan", "arctan2": "atan2", "power": "pow",
-    "arcsinh": "asinh", "arccosh": "acosh", "arctanh": "atanh",
-}  # fmt: skip
 
 
 class Block:
-    """Straight-line code at one node.
-
-    Args:
-        layout: the arrays.
-        prefix: of its names.
-        external: functions called so far and their numbers of arguments; added to.
-    """
+    """Straight-line code at one node; functions that it calls are added to `external`."""
 
     def __init__(self, layout: Layout, prefix: str, external: dict[str, int]) -> None:
         self._layout, self._prefix, self._external = layout, prefix, external
         self.lines: list[str] = []
-        self.names: dict[int, str] = {}
-        self.rows: dict[str, str] = {}
-        self._calls: dict[tuple[str, str], str] = {}
+        self.names: dict[int, str] = {}  # of values, by the indices of their expressions
+        self.rows: dict[str, str] = {}  # names of addresses, by place
 
     def value(self, wanted: Expression) -> str:
         """The name of an expression's value, after the code that computes it."""
-        stack = [wanted]
-        while stack:
-            e = stack[-1]
-            if e.index in self.names:
-                stack.pop()
-                continue
-            missing = [a for a in e.args if a.index not in self.names]
-            if missing:
-                stack.extend(reversed(missing))
-                continue
-            stack.pop()
+        for e in reachable([wanted], self.names):
             self.names[e.index] = self._compute(e)
         return self.names[wanted.index]
 
-    def store(self, place: str, entry: int, value: str) -> None:
-        """Write a value into a row."""
-        address = f"%{self._prefix}s{len(self.lines)}"
-        self.lines.append(f"{address} = getelementptr double, ptr {self._row(place)}, i64 {entry}")
-        self.lines.append(f"store double {value}, ptr {address}")
+    def store(self, writes: Mapping[tuple[str, int], Expression]) -> None:
+        """Write values into rows: all are computed before one can be overwritten."""
+        values = {place: self.value(e) for place, e in writes.items()}
+        for i, ((place, entry), value) in enumerate(values.items()):
+            address = f"%{self._prefix}s{i}"
+            self._point(address, place, entry)
+            self.lines.append(f"store double {value}, ptr {address}")
 
-    def _row(self, place: str) -> str:
-        """The address of a row of this node, or of the next (`name>`)."""
+    def _point(self, address: str, place: str, entry: int) -> None:
+        """The address of an entry in a row of this node, or of the next (`name>`)."""
         if place not in self.rows:
             name = place.removesuffix(SymbolRows.AHEAD)
-            field = self._layout[name]
-            row = self.rows[place] = f"%{self._prefix}.row{len(self.rows)}"
-            if field.single:
-                self.lines.append(f"{row} = getelementptr double, ptr %base.{name}, i64 0")
-            else:
-                node = f"%{self._prefix}.{'at' if place == name else 'next'}"
-                self.lines.append(f"{row}.offset = mul i64 {node}, {field.width}")
-                self.lines.append(
-                    f"{row} = getelementptr double, ptr %base.{name}, i64 {row}.offset"
-                )
-        return self.rows[place]
+            row, offset = f"%{self._prefix}.row{len(self.rows)}", "0"
+            if not self._layout[name].single:
+                node, offset = "at" if place == name else "next", f"{row}.offset"
+                width = self._layout[name].width
+                self.lines.append(f"{offset} = mul i64 %{self._prefix}.{node}, {width}")
+            self.lines.append(f"{row} = getelementptr double, ptr %base.{name}, i64 {offset}")
+            self.rows[place] = row
+        self.lines.append(f"{address} = getelementptr double, ptr {self.rows[place]}, i64 {entry}")
 
     def _compute(self, e: Expression) -> str:
+        """The name of a value whose operands are there; of a constant, itself."""
         if e.op == "constant":
             return literal(e.value)
-        name, lines = f"%{self._prefix}v{e.index}", self.lines
-        args = [self.names[a.index] for a in e.args]
+        name, args = f"%{self._prefix}v{e.index}", [self.names[a.index] for a in e.args]
         if e.op == "input":
-            place, entry = e.value
-            lines.append(f"{name}p = getelementptr double, ptr {self._row(place)}, i64 {entry}")
-            lines.append(f"{name} = load double, ptr {name}p")
-        elif e.op in _OPERATORS:
-            lines.append(f"{name} = {_OPERATORS[e.op]} contract double {', '.join(args)}")
-        elif e.op == "neg":
-            lines.append(f"{name} = fneg double {args[0]}")
+            self._point(f"{name}p", *e.value)
+            self.lines.append(f"{name} = load double, ptr {name}p")
+            return name
+        llvm = OPERATIONS[e.op].llvm or e.op
+        operands, given = ", ".join(args), [f"double {a}" for a in args]
+        if llvm.startswith("fcmp"):
+            lines = [f"c = {llvm} double {operands}", f" = uitofp i1 {name}c to double"]
         elif e.op == "where":
-            lines.append(f"{name}c = fcmp ogt double {args[0]}, {literal(0.0)}")
-            lines.append(f"{name} = select i1 {name}c, double {args[1]}, double {args[2]}")
-        elif e.op in _COMPARISONS:
-            lines.append(f"{name}c = fcmp {_COMPARISONS[e.op]} double {args[0]}, {args[1]}")
-            lines.append(f"{name} = uitofp i1 {name}c to double")
-        elif e.op == "sign":
-            for side, test in (("u", "ogt"), ("d", "olt")):
-                lines.append(f"{name}{side}c = fcmp {test} double {args[0]}, {literal(0.0)}")
-                lines.append(f"{name}{side} = uitofp i1 {name}{side}c to double")
-            lines.append(f"{name} = fsub double {name}u, {name}d")
+            test = f"c = fcmp ogt {given[0]}, {literal(0.0)}"
+            lines = [test, f" = select i1 {name}c, {given[1]}, {given[2]}"]
+        elif e.op == "sign":  # ±1, or x + 0: not a number if x is none
+            lines = [
+                f"z = fadd {given[0]}, {literal(0.0)}",
+                f"d = fcmp olt {given[0]}, {literal(0.0)}",
+                f"n = select i1 {name}d, double {literal(-1.0)}, double {name}z",
+                f"u = fcmp ogt {given[0]}, {literal(0.0)}",
+                f" = select i1 {name}u, double {literal(1.0)}, double {name}n",
+            ]
+        elif e.op in ("add", "sub", "mul", "div", "neg"):
+            lines = [f" = {llvm} double {operands}"]
         else:
-            intrinsic = _INTRINSICS.get(e.op)
-            function = f"llvm.{intrinsic}.f64" if intrinsic else _C_NAMES.get(e.op, e.op)
-            self._external[function] = len(args)
-            given = ", ".join(f"double {a}" for a in args)
-            lines.append(f"{name} = call double @{function}({given})")
+            self._external[llvm] = len(args)
+            lines = [f" = call double @{llvm}({', '.join(given)})"]
+        self.lines.extend(name + line for line in lines)
         return name
 
 
@@ -126,21 +95,14 @@ def literal(value: float) -> str:
 def module(
     recursions: Sequence[Recursion], graph: Graph, layout: Layout, known: Mapping[str, np.ndarray]
 ) -> str:
-    """Assembly of some recursions.
+    """Assembly of some recursions, a function each, on arrays in the layout's order.
 
-    Args:
-        recursions: one function each.
-        graph: where the problem's expressions live.
-        layout: arrays, in the order of the table of addresses.
-        known: see :class:`.recursion.SymbolRows`.
+    Expressions are those of the graph; for `known` see :class:`.recursion.SymbolRows`.
     """
     external: dict[str, int] = {}
     functions = [_function(r, graph, layout, known, external) for r in recursions]
-    declared = [
-        f"declare double @{name}({', '.join(['double'] * arity)})"
-        for name, arity in external.items()
-    ]
-    return "\n".join([*declared, *functions])
+    given = {name: ", ".join(["double"] * arity) for name, arity in external.items()}
+    return "\n".join([*(f"declare double @{f}({given[f]})" for f in given), *functions])
 
 
 def _function(
@@ -152,59 +114,42 @@ def _function(
 ) -> str:
     start, node, end = (Block(layout, p, external) for p in ("start", "node", "end"))
     rows = SymbolRows(graph, layout, known)
-    begun, _ = pack(recursion.start(rows))
+    begun, unpack = pack(recursion.start(rows))
     initial = [start.value(graph.lift(e)) for e in begun]
-    _finish(start, rows)
+    start.store(rows.writes)
 
     symbols = list(graph.inputs(f"{recursion.name}.carried", (len(begun),)))
-    rows, (_, unpack) = SymbolRows(graph, layout, known), pack(recursion.start(rows))
+    rows = SymbolRows(graph, layout, known)
     following, _ = pack(recursion.step(rows, unpack(symbols)))
-    for i, symbol in enumerate(symbols):
-        node.names[symbol.index] = f"%carried{i}"
+    node.names.update({symbol.index: f"%carried{i}" for i, symbol in enumerate(symbols)})
     after = [node.value(graph.lift(e)) for e in following]
-    _finish(node, rows)
+    node.store(rows.writes)
 
     if recursion.end is not None:
         rows = SymbolRows(graph, layout, known)
         recursion.end(rows, unpack(symbols))
-        for symbol, name in zip(symbols, after, strict=True):
-            end.names[symbol.index] = name
-        _finish(end, rows)
-    return _text(recursion, layout, (start, node, end), initial, after)
-
-
-def _finish(block: Block, rows: SymbolRows) -> None:
-    """Values first, then stores: what is read is what was there before."""
-    values = {place: block.value(e) for place, e in rows.writes.items()}
-    for (place, entry), value in values.items():
-        block.store(place, entry, value)
-
-
-def _text(
-    recursion: Recursion,
-    layout: Layout,
-    blocks: tuple[Block, Block, Block],
-    initial: list[str],
-    after: list[str],
-) -> str:
-    start, node, end = blocks
-    used = {place.removesuffix(SymbolRows.AHEAD) for block in blocks for place in block.rows}
-    bases = [
-        line
-        for i, name in enumerate(layout)
-        if name in used
-        for line in (
-            f"%slot.{name} = getelementptr i64, ptr %table, i64 {i}",
-            f"%word.{name} = load i64, ptr %slot.{name}",
-            f"%base.{name} = inttoptr i64 %word.{name} to ptr",
-        )
-    ]
-    down = recursion.descending
+        end.names.update({s.index: name for s, name in zip(symbols, after, strict=True)})
+        end.store(rows.writes)
     phis = [
         f"%carried{i} = phi double [{a}, %start], [{b}, %node]"
         for i, (a, b) in enumerate(zip(initial, after, strict=True))
     ]
-    lines = [
+    return "\n".join(_lines(recursion, layout, (start, node, end), phis))
+
+
+def _lines(
+    recursion: Recursion, layout: Layout, blocks: tuple[Block, Block, Block], phis: list[str]
+) -> list[str]:
+    used = {place.removesuffix(SymbolRows.AHEAD) for block in blocks for place in block.rows}
+    bases = [
+        f"%slot.{name} = getelementptr ptr, ptr %table, i64 {i}\n"
+        f"%base.{name} = load ptr, ptr %slot.{name}"
+        for i, name in enumerate(layout)
+        if name in used
+    ]
+    start, node, end = blocks
+    down = recursion.descending
+    return [
         f"define void @{recursion.name}(i64 %K, ptr %table) {{",
         "start:",
         *bases,
@@ -229,4 +174,3 @@ def _text(
         "ret void",
         "}",
     ]
-    return "\n".join(lines)

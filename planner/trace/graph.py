@@ -5,75 +5,52 @@ code is traced, and derivatives of any order stay small. Three kinds of leaves:
 
     inputs       symbols by name and entry: graph.inputs("x", (5,))
     constants    numbers that belong to the structure: of our own equations, 0, 1, −1, exponents
-    numbers      what the traced code wrote or read as a number: entries of the input "number",
-                 their values in `graph.numbers`. The same code with other numbers makes the same
-                 graph, so what was compiled for one serves the other.
+    numbers      all others of the traced code: entries of the input "number", with their values in
+                 `graph.numbers`. Code compiled for some serves the same functions with others.
 
 An expression goes through array code as a number would: NumPy hands arithmetic and functions to
-the entries of an array of dtype object (`np.cos` calls `.cos()`); :mod:`.arrays` does the rest.
-What a trace cannot record, above all a branch on a value, raises `TraceError`.
+the entries of an array of dtype object (`np.cos` calls `.cos()`). What a trace cannot record,
+above all a branch on a value, raises `TraceError`.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
+import operator
 from array import array
 from collections.abc import Callable, Iterable
 from itertools import chain
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from slipcar.planner.trace import arithmetic as op
-from slipcar.planner.trace.derivatives import (
-    FUNCTIONS,
-    OPERATIONS,
-    derivative,
-    hessian,
-    jacobian,
-    reachable,
-)
+from slipcar.planner.trace.derivatives import FUNCTIONS, OPERATIONS, jacobian, reachable
 from slipcar.planner.trace.errors import OpaqueError, TraceError
 
-__all__ = [
-    "FUNCTIONS",
-    "OPERATIONS",
-    "Expression",
-    "Graph",
-    "OpaqueError",
-    "TraceError",
-    "derivative",
-    "hessian",
-    "jacobian",
-    "reachable",
-]
+__all__ = ["Expression", "Graph", "OpaqueError", "TraceError", "jacobian", "reachable"]
 
-_INDEX = attrgetter("index")
+_INDEX = operator.attrgetter("index")
 _CODES = {name: code for code, name in enumerate(OPERATIONS)}
 _NUMBERS = (int, float, np.integer, np.floating, np.bool_)
+#: Values of the operations that NumPy has no function of that name for.
+_VALUES: dict[str, Any] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
+    "neg": operator.neg, "abs": abs, "erfc": math.erfc,
+}  # fmt: skip
 
 
 class Graph:
-    """Owns the expressions of one trace: equal ones are the same object.
+    """Owns the expressions of one trace: equal ones are the same object."""
 
-    Args:
-        parametric: whether numbers of traced code are entries of the input "number"; otherwise
-            they are constants, easier to read.
-
-    Attributes:
-        size: number of expressions.
-        numbers: values of the input "number".
-        tracing: whether numbers that are lifted come from traced code; see `lift`.
-        tangents: slopes known so far, by the indices of the symbols; see :mod:`.derivatives`.
-    """
-
-    def __init__(self, parametric: bool = True) -> None:
-        self.parametric, self.tracing = parametric, False
-        self.numbers: list[float] = []
+    def __init__(self) -> None:
+        self.size = 0  # number of expressions
+        self.tracing = False  # whether numbers that are lifted come from traced code
+        self.numbers: list[float] = []  # values of the input "number"
+        # Slopes known so far, by the indices of the symbols; see .derivatives.
         self.tangents: dict[tuple[int, ...], dict[int, dict[int, Expression]]] = {}
-        self.size = 0
         self._known: dict[tuple[int, ...], Expression] = {}  # (code, operands' indices)
         self._leaves: dict[Any, Expression] = {}
         self._numbers: list[int] = []  # indices of the numbers
@@ -81,13 +58,20 @@ class Graph:
     def make(self, name: str, args: tuple[Expression, ...], value: Any = None) -> Expression:
         """The expression name(args), or the leaf with this value: the known one if there is one.
 
-        Nothing is folded: see :mod:`.arithmetic` for that.
+        Operations on constants alone are computed; all other folding is :mod:`.arithmetic`'s.
         """
         if not args:
             return self._leaf(name, value)
         key = (_CODES[name], *map(_INDEX, args))
         known = self._known.get(key)
         if known is None:
+            for a in args:
+                if a.op != "constant":
+                    break
+            else:
+                with np.errstate(all="ignore"):
+                    function = _VALUES.get(name) or getattr(np, name)
+                    return self.constant(function(*(a.value for a in args)))
             known = self._known[key] = Expression(self, name, args, None, self.size)
             self.size += 1
         return known
@@ -105,14 +89,9 @@ class Graph:
         return self._leaf("constant", float(value) + 0.0)
 
     def number(self, value: float, *, special: bool = True) -> Expression:
-        """A number that the structure does not depend on.
-
-        Args:
-            value: the number.
-            special: whether 0, 1 and −1 belong to the structure, where they make it simpler.
-        """
+        """A number that the structure does not depend on; but on 0, 1 and −1, if special."""
         value = float(value)
-        if not self.parametric or (special and value in (0.0, 1.0, -1.0)):
+        if special and value in (0.0, 1.0, -1.0):
             return self.constant(value)
         entry = ("number", len(self.numbers))
         self.numbers.append(value)
@@ -121,33 +100,22 @@ class Graph:
         return Expression(self, "input", (), entry, self.size - 1)
 
     def inputs(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """An array of symbols: entries of the input `name`, numbered in C order.
-
-        Raises:
-            ValueError: for the name "number", which is that of the numbers.
-        """
-        if name == "number":
-            raise ValueError("the input 'number' holds the numbers of traced code")
-        flat = [self._leaf("input", (name, i)) for i in range(math.prod(shape))]
-        symbols = np.empty(len(flat), dtype=object)
-        symbols[:] = flat
+        """An array of symbols: entries of the input `name`, numbered in C order."""
+        symbols = np.empty(math.prod(shape), dtype=object)
+        symbols[:] = [self._leaf("input", (name, i)) for i in range(len(symbols))]
         return symbols.reshape(shape)
 
     def lift(self, value: Any) -> Expression:
-        """A number or an expression of this graph, as an expression.
+        """A number or an expression of this graph, as an expression; a TraceError for all else.
 
-        Numbers become entries of the input "number" while code is traced (see :mod:`.tracing`),
-        constants otherwise.
-
-        Raises:
-            TraceError: for anything else.
+        Numbers become entries of the input "number" while code is traced, constants otherwise.
         """
         if type(value) is Expression:
             if value.graph is not self:
                 raise TraceError("an expression of another trace was kept and used", "a cache")
             return value
         if isinstance(value, _NUMBERS):
-            return self.number(float(value)) if self.tracing else self.constant(float(value))
+            return (self.number if self.tracing else self.constant)(float(value))
         if isinstance(value, np.ndarray) and value.ndim == 0:
             return self.lift(value.item())
         if value is None:
@@ -155,40 +123,32 @@ class Graph:
         kind = type(value).__name__
         raise TraceError(f"{kind} is neither a real number nor an expression", f"a {kind}")
 
-    def choose(self, condition: Expression, a: Expression, b: Expression) -> Expression:
-        """The value a where the condition is > 0, else b: also where it is not a number."""
-        return op.where(condition, a, b)
-
     def structure(self, *outputs: Iterable[Expression]) -> bytes:
-        """A key of all expressions made so far, in order, but for the values of numbers.
-
-        Args:
-            outputs: rows of expressions that count too: which they are, and in which order.
-        """
+        """A key of all expressions made so far and of rows of outputs, but not of the numbers."""
         rows = [tuple(map(_INDEX, row)) for row in outputs]
         text = repr(([(value, leaf.index) for value, leaf in self._leaves.items()], rows))
         key = hashlib.blake2b(text.encode(), digest_size=16)
-        key.update(array("q", self._numbers))
-        key.update(b"|")
+        key.update(array("q", self._numbers).tobytes() + b"|")
         key.update(array("q", chain.from_iterable(self._known)))
         return key.digest()
 
 
-def _operator(
-    rule: Callable[[Expression, Expression], Expression], *, swapped: bool = False
-) -> Callable[[Expression, Any], Any]:
-    """A binary operator of Python; NotImplemented for what is no number."""
+def _operator(rule: Callable[..., Expression]) -> tuple[Any, Any]:
+    """A binary operator of Python and its reflection; NotImplemented for what is no number."""
 
     def apply(self: Expression, other: Any) -> Any:
-        if type(other) is not Expression:
-            if not isinstance(other, _NUMBERS):
-                return NotImplemented
-            other = self.graph.lift(other)
-        elif other.graph is not self.graph:
-            other = self.graph.lift(other)
-        return rule(other, self) if swapped else rule(self, other)
+        if type(other) is Expression and other.graph is self.graph:
+            return rule(self, other)
+        if type(other) is Expression or isinstance(other, _NUMBERS):
+            return rule(self, self.graph.lift(other))
+        return NotImplemented
 
-    return apply
+    def reflected(self: Expression, other: Any) -> Any:
+        if type(other) is Expression or isinstance(other, _NUMBERS):
+            return rule(self.graph.lift(other), self)
+        return NotImplemented
+
+    return apply, reflected
 
 
 def _power(base: Expression, exponent: Any) -> Any:
@@ -200,6 +160,17 @@ def _power(base: Expression, exponent: Any) -> Any:
     elif not isinstance(exponent, Expression):
         return NotImplemented
     return op.power(base, base.graph.lift(exponent))
+
+
+def _of_conditions(rule: Callable[..., Expression]) -> Callable[..., Expression]:
+    """A rule for &, | and ~: on conditions alone."""
+
+    def apply(*args: Expression) -> Expression:
+        if not all(map(op.is_condition, args)):
+            raise TraceError("&, |, ^ and ~ are for conditions such as x > 0", "a bit operation")
+        return rule(*args)
+
+    return apply
 
 
 def _refusal(what: str, instead: str, kind: type[TraceError] = TraceError) -> Callable[..., Any]:
@@ -214,14 +185,11 @@ _PLAIN = "np.sin(x) for math.sin(x); np.zeros_like(x) or dtype=x.dtype for array
 
 
 class Expression:
-    """A scalar: how it is computed from inputs and constants.
+    """A scalar: how it is computed from inputs and constants of its graph.
 
-    Attributes:
-        graph: the trace it belongs to.
-        op: "input", "constant", or a key of :data:`.derivatives.OPERATIONS`.
-        args: its operands.
-        value: (name, entry) of an input, the number of a constant.
-        index: position in the order of creation: operands come before what uses them.
+    `op` is "input", "constant" or a key of :data:`.derivatives.OPERATIONS`, `args` its operands;
+    `value` is (name, entry) of an input, the number of a constant; `index` its position in the
+    order of creation: operands come before what uses them.
     """
 
     __slots__ = ("args", "graph", "index", "op", "value")
@@ -237,44 +205,44 @@ class Expression:
         return self.op == "constant" and self.value == 0.0
 
     def __repr__(self) -> str:
-        leaf = self.op in ("input", "constant")
-        return f"<{self.value if leaf else self.op} #{self.index}>"
+        return f"<{self.op if self.args else self.value} #{self.index}>"
 
-    # As a scalar among arrays.
-    shape = ()
-    ndim = 0
-    size = 1
-    dtype = np.dtype(object)
-
-    __add__, __radd__ = _operator(op.add), _operator(op.add, swapped=True)
-    __sub__, __rsub__ = _operator(op.sub), _operator(op.sub, swapped=True)
-    __mul__, __rmul__ = _operator(op.mul), _operator(op.mul, swapped=True)
-    __truediv__, __rtruediv__ = _operator(op.div), _operator(op.div, swapped=True)
-    __pow__, __rpow__ = _power, _operator(op.power, swapped=True)
-    __gt__, __lt__ = _operator(op.greater), _operator(op.greater, swapped=True)
-    __ge__, __le__ = _operator(op.greater_equal), _operator(op.greater_equal, swapped=True)
-    __eq__ = _operator(op.equal)
-    __ne__ = _operator(lambda a, b: op.negation(op.equal(a, b)))
-    arctan2 = _operator(lambda a, b: op.call("arctan2", a, b))
-    hypot = _operator(lambda a, b: op.call("hypot", a, b))
+    shape, ndim, size, dtype = (), 0, 1, np.dtype(object)  # as of a scalar among arrays
+    __add__, __radd__ = _operator(op.add)
+    __sub__, __rsub__ = _operator(op.sub)
+    __mul__, __rmul__ = _operator(op.mul)
+    __truediv__, __rtruediv__ = _operator(op.div)
+    __floordiv__, __rfloordiv__ = _operator(lambda a, b: (a / b).floor())
+    __mod__, __rmod__ = _operator(lambda a, b: a - b * (a / b).floor())
+    __pow__, __rpow__ = _power, _operator(op.power)[1]
+    __gt__, __lt__ = _operator(op.greater)
+    __ge__, __le__ = _operator(functools.partial(op.call, "greater_equal"))
+    __eq__ = _operator(op.equal)[0]
+    __ne__ = _operator(lambda a, b: op.negation(op.equal(a, b)))[0]
+    __and__, __rand__ = _operator(_of_conditions(op.mul))
+    __or__, __ror__ = _operator(_of_conditions(op.maximum))
+    __xor__, __rxor__ = _operator(_of_conditions(lambda a, b: a != b))
+    __neg__, __abs__, __invert__ = op.neg, op.absolute, _of_conditions(op.negation)
+    arctan2 = _operator(functools.partial(op.call, "arctan2"))[0]
+    hypot = _operator(functools.partial(op.call, "hypot"))[0]
 
     def __hash__(self) -> int:
         return self.index
-
-    def __neg__(self) -> Expression:
-        return op.neg(self)
-
-    def __pos__(self) -> Expression:
-        return self
-
-    def __abs__(self) -> Expression:
-        return op.absolute(self)
 
     def __floor__(self) -> Expression:
         return op.call("floor", self)
 
     def __ceil__(self) -> Expression:
         return op.neg(op.call("floor", op.neg(self)))
+
+    def __trunc__(self) -> Expression:
+        return op.where(self > 0.0, self.__floor__(), self.__ceil__())
+
+    def item(self, *args: Any) -> Expression:
+        """Itself: a value, to be copied by nobody, as derivatives would not know the copy."""
+        return self
+
+    __pos__ = __copy__ = __deepcopy__ = conjugate = item
 
     __bool__ = _refusal("a branch (if, and, or, while)", _BRANCH)
     __float__ = _refusal("float()", _PLAIN, OpaqueError)
@@ -283,41 +251,8 @@ class Expression:
     __index__ = _refusal("an index", "np.interp or np.where for tables", OpaqueError)
     __round__ = _refusal("round()", "np.floor(x + 0.5)")
 
-    if TYPE_CHECKING:  # FUNCTIONS are methods, see below
 
-        def __getattr__(self, name: str) -> Callable[[], Expression]: ...
-
-    def __copy__(self) -> Expression:
-        return self  # a value: a second object would not be recognised by derivatives
-
-    def __deepcopy__(self, memo: Any) -> Expression:
-        return self
-
-    # NumPy's ufuncs ask the entries of an array of dtype object for methods of their names.
-
-    def square(self) -> Expression:
-        """x²."""
-        return op.mul(self, self)
-
-    def reciprocal(self) -> Expression:
-        """1/x."""
-        return op.div(self.graph.constant(1.0), self)
-
-    def conjugate(self) -> Expression:
-        """Itself: traced numbers are real."""
-        return self
-
-    def item(self) -> Expression:
-        """Itself, as of an array of one entry."""
-        return self
-
-
-def _method(name: str) -> Callable[[Expression], Expression]:
-    rule = {"sqrt": op.sqrt, "abs": op.absolute}.get(name)
-    if rule is not None:
-        return lambda self: rule(self)
-    return lambda self: op.call(name, self)
-
-
+# NumPy's functions ask the entries of an array of dtype object for methods of their names.
 for _name in FUNCTIONS:
-    setattr(Expression, _name, _method(_name))
+    _rule: Any = {"sqrt": op.sqrt, "abs": op.absolute}.get(_name)
+    setattr(Expression, _name, _rule or (lambda self, name=_name: self.graph.make(name, (self,))))

@@ -3,11 +3,12 @@
 A file holds one object under the hash of what it was made from: the structure of the expressions,
 the generator's own source, the versions and the processor. So it can never be yesterday's code. It
 is written atomically; one that is damaged or foreign is compiled anew, and a folder that cannot be
-written to is done without.
+written to is done without. Of more than 500 files the oldest are removed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -23,18 +24,20 @@ from typing import Any
 PROTOTYPE = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
 #: Beyond so many characters of assembly LLVM's optimiser takes longer than its work saves.
 _OPTIMISED = 1_000_000
+#: Most files that are kept.
+_KEPT = 500
 _lock = threading.RLock()
 _told: set[str] = set()
 
 
 def available() -> bool:
     """Whether there is LLVM (the package llvmlite)."""
-    return _machine() is not None
+    return _machine(1) is not None
 
 
 @functools.cache
-def _machine() -> Any:
-    """LLVM's target machines, unoptimised and optimised, or None without llvmlite."""
+def _machine(opt: int) -> Any:
+    """LLVM's target machine for a level of optimisation, or None without llvmlite."""
     try:
         import llvmlite.binding as llvm
     except ImportError:
@@ -43,10 +46,7 @@ def _machine() -> Any:
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
     features = llvm.get_host_cpu_features().flatten()
-    return [
-        target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=opt)
-        for opt in (0, 1)
-    ]
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=opt)
 
 
 @functools.cache
@@ -55,26 +55,19 @@ def _surroundings() -> bytes:
     import llvmlite
     import llvmlite.binding as llvm
 
-    digest = hashlib.sha256()
-    for text in (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(),
-                 llvmlite.__version__, llvm.get_process_triple()):  # fmt: skip
-        digest.update(text.encode() + b"\0")
-    planner = Path(__file__).parents[1]
+    features = llvm.get_host_cpu_features().flatten()
+    processor = (llvm.get_host_cpu_name(), features, llvm.get_process_triple())
+    digest = hashlib.sha256(repr((*processor, llvmlite.__version__)).encode())
     for room in ("trace", "problem", "moments", "lq", "newton"):
-        for path in sorted((planner / room).glob("*.py")):
+        for path in sorted((Path(__file__).parents[1] / room).glob("*.py")):
             digest.update(path.read_bytes())
     return digest.digest()
 
 
 class Code:
-    """Functions of one object file, loaded into this process.
+    """Functions of one object file, loaded into this process: `functions`, by name.
 
-    Args:
-        data: the object file.
-        names: of its functions.
-
-    Attributes:
-        functions: by name, to be called with K and the address of a table of addresses.
+    They are called with K and the address of a table of addresses.
     """
 
     def __init__(self, data: bytes, names: Sequence[str]) -> None:
@@ -82,27 +75,21 @@ class Code:
 
         with _lock:
             # An engine owns its machine, so each has one of its own.
-            target = llvm.Target.from_default_triple()
-            self._engine = llvm.create_mcjit_compiler(
-                llvm.parse_assembly(""), target.create_target_machine()
-            )
+            machine = llvm.Target.from_default_triple().create_target_machine()
+            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
             self._engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(data))
             self._engine.finalize_object()
-            self.functions = {
-                name: PROTOTYPE(self._engine.get_function_address(name)) for name in names
-            }
+            address = self._engine.get_function_address
+            self.functions = {name: PROTOTYPE(address(name)) for name in names}
 
 
 def code(key: bytes, names: Sequence[str], assembly: Callable[[], str], estimate: str = "") -> Code:
-    """Functions known by a key: from disk, or from the assembly.
+    """The named functions, from disk or from the assembly, which is made only where it is needed.
 
-    Args:
-        key: of all that the assembly is made from but this package's source.
-        names: of the functions.
-        assembly: makes the text; called where there is no object file.
-        estimate: what to say on stderr before a long compilation; empty says nothing.
+    The key is that of all that goes into it but our source; a long compilation is announced.
     """
-    path = _file(hashlib.sha256(_surroundings() + key).hexdigest())
+    place, name = folder(), hashlib.sha256(_surroundings() + key).hexdigest()
+    path = None if place is None else place / f"{name}.o"
     data = _read(path)
     if data is not None:
         try:
@@ -112,7 +99,9 @@ def code(key: bytes, names: Sequence[str], assembly: Callable[[], str], estimate
     if estimate:
         print(f"slipcar: {estimate}", file=sys.stderr, flush=True)
     data = compiled(assembly())
-    _write(path, data)
+    if path is not None:
+        with contextlib.suppress(OSError):  # a read-only or full disk: compiled again next time
+            _write(path, data)
     return Code(data, names)
 
 
@@ -123,7 +112,7 @@ def compiled(assembly: str) -> bytes:
     with _lock:
         module = llvm.parse_assembly(assembly)
         module.verify()
-        return _machine()[len(assembly) <= _OPTIMISED].emit_object(module)
+        return _machine(int(len(assembly) <= _OPTIMISED)).emit_object(module)
 
 
 def tell_once(message: str) -> None:
@@ -135,18 +124,12 @@ def tell_once(message: str) -> None:
 
 @functools.cache
 def folder() -> Path | None:
-    """Where object files are kept: SLIPCAR_CACHE_DIR, else the user's cache; None without a home."""
-    given = os.environ.get("SLIPCAR_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    """Where object files are kept; None without a home."""
+    own, users = (os.environ.get(name) for name in ("SLIPCAR_CACHE_DIR", "XDG_CACHE_HOME"))
     try:
-        base = Path(given) if given else Path.home() / ".cache"
+        return Path(own) if own else Path(users or Path.home() / ".cache") / "slipcar"
     except RuntimeError:  # no home directory
         return None
-    return base if os.environ.get("SLIPCAR_CACHE_DIR") else base / "slipcar"
-
-
-def _file(name: str) -> Path | None:
-    place = folder()
-    return None if place is None else place / f"{name}.o"
 
 
 def _read(path: Path | None) -> bytes | None:
@@ -155,23 +138,23 @@ def _read(path: Path | None) -> bytes | None:
         content = path.read_bytes() if path is not None else b""
     except OSError:
         return None
-    digest, data = content[:32], content[32:]
-    if not content:
-        return None
-    if hashlib.sha256(data).digest() != digest:
+    if hashlib.sha256(content[32:]).digest() == content[:32]:
+        return content[32:]
+    if content:
         tell_once(f"the cached code {path} is damaged: compiled anew")
-        return None
-    return data
+    return None
 
 
-def _write(path: Path | None, data: bytes) -> None:
-    if path is None:
-        return
+def _write(path: Path, data: bytes) -> None:
+    """Write an object into a file, all or nothing, and remove the oldest files of its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         with os.fdopen(handle, "wb") as file:
             file.write(hashlib.sha256(data).digest() + data)
         os.replace(temporary, path)
-    except OSError:  # a read-only or full disk: compiled again next time
-        return
+    except OSError:
+        os.unlink(temporary)
+        raise
+    for old in sorted(path.parent.glob("*.o"), key=os.path.getmtime)[:-_KEPT]:
+        old.unlink(missing_ok=True)

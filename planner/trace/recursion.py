@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from functools import partialmethod
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,7 @@ Carried = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """An array of a layout.
-
-    Attributes:
-        shape: of one row.
-        single: whether it has one row for all nodes.
-    """
+    """An array of a layout: rows of a shape, one for each node, or a single one for all."""
 
     shape: tuple[int, ...]
     single: bool = False
@@ -43,16 +39,10 @@ Layout = Mapping[str, Field]
 
 @dataclasses.dataclass(frozen=True)
 class Recursion:
-    """A loop over nodes 0..K−1 (or back), between a beginning and an end.
+    """A loop over nodes 0..K−1, or back if it is descending, between a beginning and an end.
 
-    Ascending, `start` looks at node 0 and `end` at node K; descending it is the other way round.
-
-    Attributes:
-        name: of the kernel.
-        step: (rows at a node, carried) -> carried to the next one.
-        start: rows where it begins -> carried to the first node.
-        end: (rows where it ends, carried); None does nothing there.
-        descending: whether it goes from node K − 1 to node 0.
+    What is carried from node to node `start` makes of the rows at node 0, and `step` of those at
+    every node; `end` looks at node K. Descending, it begins at K and ends at 0.
     """
 
     name: str
@@ -72,43 +62,31 @@ class Symmetric:
 def pack(carried: Carried) -> tuple[list[Any], Callable[[list[Any]], Carried]]:
     """Carried values as one flat list, and the function that puts such a list together again."""
     flat: list[Any] = []
-    parts: list[tuple[str, tuple[int, ...], Any]] = []
+    places: dict[str, Array] = {}  # of every entry in the list
     for name, value in carried.items():
         if isinstance(value, Symmetric):
             upper = np.triu_indices(len(value.matrix))
-            parts.append((name, value.matrix.shape, upper))
+            places[name] = np.zeros(value.matrix.shape, dtype=int)
+            places[name][upper] = places[name].T[upper] = len(flat) + np.arange(len(upper[0]))
             flat.extend(value.matrix[upper])
         else:
             value = np.asarray(value)
-            parts.append((name, value.shape, None))
+            places[name] = len(flat) + np.arange(value.size).reshape(value.shape)
             flat.extend(value.ravel())
 
     def unpack(values: list[Any]) -> Carried:
-        rest = iter(values)
-        return {name: _part(rest, shape, upper) for name, shape, upper in parts}
+        entries = np.empty(len(values), dtype=object)
+        entries[:] = values
+        return {name: entries[place] for name, place in places.items()}
 
     return flat, unpack
 
 
-def _part(values: Iterator[Any], shape: tuple[int, ...], upper: Any) -> Any:
-    if upper is None:
-        array = np.empty(math.prod(shape), dtype=object)
-        for i in range(len(array)):
-            array[i] = next(values)
-        return array.reshape(shape) if shape else array[0]
-    full = np.empty(shape, dtype=object)
-    for i, j in zip(*upper, strict=True):
-        full[i, j] = full[j, i] = next(values)
-    return full
-
-
 class SymbolRows:
-    """Rows of a layout as symbols of a graph; entries known to be constant are constants.
+    """Rows of a layout as symbols of a graph, of arrays in `known` as the constants they hold.
 
-    Args:
-        graph: owner of the symbols.
-        layout: the arrays.
-        known: arrays of expressions, entries of which that are constants replace the symbols.
+    Attributes:
+        writes: expressions by place and entry; the place of the next node's row ends in `AHEAD`.
     """
 
     AHEAD = ">"
@@ -116,42 +94,29 @@ class SymbolRows:
     def __init__(self, graph: Graph, layout: Layout, known: Mapping[str, Array]) -> None:
         self.graph, self._layout, self._known = graph, layout, known
         self.writes: dict[tuple[str, int], Expression] = {}
-        self._read: dict[str, Any] = {}
+        self._rows: dict[str, Array] = {}  # read or written so far
 
-    def __getitem__(self, name: str) -> Any:
-        return self._symbols(name, name)
+    def __getitem__(self, name: str, ahead: bool = False) -> Any:
+        place = name + self.AHEAD * ahead
+        if place not in self._rows:
+            symbols = self._rows[place] = self.graph.inputs(place, self._layout[name].shape)
+            for index, entry in np.ndenumerate(self._known.get(name, ()) if symbols.ndim else ()):
+                if entry.op == "constant":
+                    symbols[index] = entry
+        row = self._rows[place]
+        return row.copy() if row.ndim else row[()]
 
-    def ahead(self, name: str) -> Any:
-        """The row of the next node."""
-        return self._symbols(name, name + self.AHEAD)
+    def write(self, name: str, value: Any, ahead: bool = False) -> None:
+        """Store a row of this node, or of the next."""
+        flat, field = np.ravel(np.asarray(value, dtype=object)), self._layout[name]
+        if len(flat) != field.width:
+            raise ValueError(f"{name} has rows of {field.width}, not {len(flat)}")
+        place, row = name + self.AHEAD * ahead, np.empty(field.width, dtype=object)
+        row[:] = list(map(self.graph.lift, flat))
+        self.writes.update({(place, i): entry for i, entry in enumerate(row)})
+        self._rows[place] = row.reshape(field.shape)  # what is written is read again
 
-    def _symbols(self, name: str, place: str) -> Any:
-        if place not in self._read:
-            symbols = self.graph.inputs(place, self._layout[name].shape)
-            if symbols.ndim == 0:
-                symbols = symbols[()]
-            elif name in self._known:
-                for index, entry in np.ndenumerate(self._known[name]):
-                    if entry.op == "constant":
-                        symbols[index] = entry
-            self._read[place] = symbols
-        value = self._read[place]
-        return value.copy() if isinstance(value, np.ndarray) else value
-
-    def write(self, name: str, value: Any) -> None:
-        """Store a row of this node."""
-        self._write(name, name, value)
-
-    def write_ahead(self, name: str, value: Any) -> None:
-        """Store a row of the next node."""
-        self._write(name, name + self.AHEAD, value)
-
-    def _write(self, name: str, place: str, value: Any) -> None:
-        flat = np.ravel(np.asarray(value, dtype=object))
-        if len(flat) != self._layout[name].width:
-            raise ValueError(f"{name} has rows of {self._layout[name].width}, not {len(flat)}")
-        for i, entry in enumerate(flat):
-            self.writes[place, i] = self.graph.lift(entry)
+    ahead, write_ahead = partialmethod(__getitem__, ahead=True), partialmethod(write, ahead=True)
 
 
 class NumberRows:
@@ -160,42 +125,33 @@ class NumberRows:
     def __init__(self, layout: Layout, arrays: Mapping[str, Array]) -> None:
         self._layout, self._arrays, self.k = layout, arrays, 0
 
-    def _row(self, name: str, k: int) -> Array:
+    def _view(self, name: str, ahead: bool) -> Array:
         field = self._layout[name]
-        return self._arrays[name][0 if field.single else k].reshape(field.shape)
+        return self._arrays[name][0 if field.single else self.k + ahead].reshape(field.shape)
 
-    def __getitem__(self, name: str) -> Any:
-        row = self._row(name, self.k)
+    def __getitem__(self, name: str, ahead: bool = False) -> Any:
+        row = self._view(name, ahead)
         return row.copy() if row.ndim else row[()]
 
-    def ahead(self, name: str) -> Any:
-        """The row of the next node."""
-        row = self._row(name, self.k + 1)
-        return row.copy() if row.ndim else row[()]
+    def write(self, name: str, value: Any, ahead: bool = False) -> None:
+        """Store a row of this node, or of the next."""
+        row = self._view(name, ahead)
+        row[...] = np.reshape(np.asarray(value, float), row.shape)
 
-    def write(self, name: str, value: Any) -> None:
-        """Store a row of this node."""
-        self._row(name, self.k)[...] = np.reshape(
-            np.asarray(value, float), self._layout[name].shape
-        )
-
-    def write_ahead(self, name: str, value: Any) -> None:
-        """Store a row of the next node."""
-        field = self._layout[name]
-        self._row(name, self.k + 1)[...] = np.reshape(np.asarray(value, float), field.shape)
+    ahead, write_ahead = partialmethod(__getitem__, ahead=True), partialmethod(write, ahead=True)
 
 
 @np.errstate(all="ignore")
 def in_numpy(recursion: Recursion, layout: Layout, arrays: Mapping[str, Array], K: int) -> None:
     """Run a recursion over K intervals on arrays of numbers, node by node."""
-    rows = NumberRows(layout, arrays)
-    rows.k = K if recursion.descending else 0
+    rows, down = NumberRows(layout, arrays), recursion.descending
+    rows.k = K if down else 0
     carried = _plain(recursion.start(rows))
-    for k in range(K - 1, -1, -1) if recursion.descending else range(K):
+    for k in range(K - 1, -1, -1) if down else range(K):
         rows.k = k
         carried = _plain(recursion.step(rows, carried))
     if recursion.end is not None:
-        rows.k = 0 if recursion.descending else K
+        rows.k = 0 if down else K
         recursion.end(rows, carried)
 
 

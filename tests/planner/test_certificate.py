@@ -14,7 +14,6 @@ from slipcar.planner.extremal.maximum_principle import (
     best_step,
     first_order,
     hamiltonian,
-    held_variance_gradient,
     minimize_over_controls,
 )
 from slipcar.planner.extremal.second_order import second_order
@@ -41,6 +40,17 @@ class Cart:
 
     def terminal(self, x):
         return x - np.array([1.0, 0.0])
+
+
+def held_variance_gradient(at, A_x, S, variance_weight):
+    """What the adjoint equation leaves out by holding Λ: the gradient of w ∫ tr Σ through A.
+
+    ∂/∂A_k of w Σ dt tr Σ_k  =  2 w Λ_{k+1} A_k Σ_k
+    """
+    gradient = np.zeros_like(at.lin.defect)
+    force = 2.0 * variance_weight * at.weights @ at.lin.A @ S[:-1]
+    gradient[:-1] = np.einsum("kab,kabi->ki", force, A_x)[1:]
+    return gradient
 
 
 @pytest.fixture(scope="module")

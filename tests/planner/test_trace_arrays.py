@@ -79,7 +79,7 @@ def _masked(x):
 ELEMENTWISE = {
     **_each(
         "sin cos arctan sinh cosh tanh exp exp2 expm1 arcsinh abs fabs sign floor ceil trunc square"
-        " deg2rad rad2deg radians degrees sinc fix negative",
+        " deg2rad rad2deg radians degrees fix negative",
         lambda f, a, b: f(0.7 * a * b),
     ),
     **_each(
@@ -91,7 +91,7 @@ ELEMENTWISE = {
         "maximum minimum fmax fmin hypot arctan2 copysign logaddexp", lambda f, a, b: f(a, b) * a
     ),
     **_each("mod remainder fmod floor_divide", lambda f, a, b: f(2.0 * a, 1.5 + b * b) * a),
-    "mod 2": _stacked(lambda a, b: (a * b) % 2.0 + np.fmod(a, 0.7) * np.divmod(b, 0.9)[1]),
+    "mod 2": _stacked(lambda a, b: (a * b) % 2.0 + np.fmod(a, 0.7) * np.mod(b, 0.9)),
     "angle in ±π": _stacked(lambda a, b: (3 * a * b + np.pi) % (2 * np.pi) - np.pi),
     "heaviside": _stacked(lambda a, b: np.heaviside(a, 0.5) * b),
     "clip": _stacked(lambda a, b: np.clip(a * b, -1.0, 0.8)),
@@ -124,8 +124,8 @@ ELEMENTWISE = {
     "interp": _stacked(lambda a, b: np.interp(a, KNOTS, VALUES) * b),
     "interp, ends": _stacked(lambda a, b: np.interp(a * b, KNOTS, VALUES, left=-9.0, right=7.0)),
     "norm": lambda x: np.stack(
-        [np.linalg.norm(x, axis=-1), np.linalg.norm(x, 1, axis=-1), np.linalg.norm(x, 3, axis=-1),
-         np.linalg.norm(x, np.inf, axis=-1), np.linalg.norm(x, -np.inf, axis=-1)], axis=-1
+        [np.linalg.norm(x, axis=-1), np.linalg.norm(x, 1, axis=-1),
+         np.linalg.norm(x, np.inf, axis=-1)], axis=-1
     ),
     "max, min": lambda x: np.stack(
         [np.max(x, axis=-1), x.min(axis=-1), np.amax(x * x, -1), np.ptp(x, axis=-1),
@@ -175,7 +175,6 @@ FROM_REST = {
     "max(v, 0)²": (lambda v: np.maximum(v, 0.0) ** 2, 0.0, 0.0),
     "|v|": (np.abs, 0.0, 0.0),
     "arctan2(v, v)": (lambda v: np.arctan2(v, v), 0.0, None),
-    "sinc": (np.sinc, 0.0, -(np.pi**2) / 3.0),
     "logaddexp": (lambda v: np.logaddexp(v, 0.0), 0.5, 0.25),
     "v² sign v": (lambda v: v * v * np.sign(v), 0.0, 0.0),
 }
@@ -218,18 +217,20 @@ def _views(x):
     return y
 
 
-def _scattered(x):
-    y = np.zeros_like(x)
-    np.add.at(y, (slice(None), np.array([0, 0, 2])), x)
-    return y
-
-
 def _rotation(x):
     R = np.zeros((*x.shape[:-1], 3, 3))
     c, s = np.cos(x[..., 0]), np.sin(x[..., 0])
     R[..., 0, 0], R[..., 0, 1], R[..., 1, 0], R[..., 1, 1] = c, -s, s, c
     R[..., 2, 2] = 1.0
     return (R @ x[..., None])[..., 0]
+
+
+def _through_views(x):
+    R = np.zeros((2, 3))
+    np.moveaxis(R, -1, 0)[1] = x[0, :2]
+    np.reshape(R, (6,))[0] = x[0, 2]
+    R.T[2, 1] = x[0, 0] * x[0, 1]
+    return R
 
 
 def _gathered(x):
@@ -255,6 +256,8 @@ def _mass(x):
 TRACED = {
     "views and in-place operations on a copy": _views,
     "zeros_like, then assigned": _assigned(np.zeros_like),
+    "zeros_like, of floats": _assigned(lambda x: np.zeros_like(x, float)),
+    "full_like, of floats": _assigned(lambda x: np.full_like(x, 2.0, dtype=np.float64)),
     "zeros_like of a slice": _assigned(lambda x: np.zeros_like(x[..., :2])),
     "zeros of floats": _assigned(lambda x: np.zeros(x.shape)),
     "zeros of float64": _assigned(lambda x: np.zeros(x.shape, dtype=np.float64)),
@@ -269,6 +272,10 @@ TRACED = {
     "row by row": _gathered,
     "inertia": _inertia,
     "a mass matrix": _mass,
+    "solutions": lambda x: (
+        np.linalg.solve(W, x[0]) + np.linalg.solve(W, x.T)[:, 0]
+        + np.linalg.solve(W + x[0, 0], [1.0, 2.0, 3.0]) + np.maximum(np.linalg.solve(W, x[0]), 0.1)
+    ),
     "inverse": lambda x: np.linalg.inv(W + x[..., None] * x[..., None, :] + 9 * np.eye(3)),
     "inverse of a diagonal": lambda x: np.linalg.inv(np.diag([x[0, 0], 8.0, x[0, 1] + 9]) + 0.3),
     "array of floats": lambda x: np.array(x, float) + np.array(x[0], dtype=np.float64),
@@ -284,7 +291,6 @@ TRACED = {
                                  + math.log(v, 2) + math.atan2(v, 2.0) + math.erf(v) + math.fabs(v)
                                  + math.sqrt(v) + math.sinh(v) for v in row] for row in x]),
     "vectorize with math": lambda x: np.vectorize(lambda v: math.cos(v) + 1.0)(x),
-    "add.at": _scattered,
     "out=": lambda x: np.add(x, 1.0, out=x.copy()),
     "out= of floats": lambda x: np.multiply(x, 2.0, out=np.empty(x.shape)),
     "where on known conditions": lambda x: np.where([True, False, True], x, x**2),
@@ -305,7 +311,16 @@ TRACED = {
     "einsum": lambda x: np.einsum("ij,kj,kj->ki", W, x, x),
     "einsum, ellipsis": lambda x: np.einsum("...i,...i->...", x, x * W[0]),
     "einsum, optimised": lambda x: np.einsum("ij,kj,lj->ki", W, x, x, optimize=True),
-    "matrix_power": lambda x: np.linalg.matrix_power(x[..., None] * W, 3),
+    "matrix_power": lambda x: np.linalg.matrix_power(x[0, 0] * W + 1.0, 3),
+    "scalars: remainders and conditions": lambda x: np.array(
+        [x[0, 0] % 0.37, 2.05 % x[0, 1], x[0, 2] // 0.33, 7.1 // x[0, 0],
+         np.where((x[0, 0] > 0.5) & ~(x[0, 1] > 1.0) | (x[0, 2] == 3.0), x[0, 0], 1.0)]
+    ),
+    "isclose": lambda x: np.isclose(x, [0.3, 2.0, 0.9]) * x,
+    "gradient": lambda x: np.gradient(x[0], 0.5),
+    "convolve": lambda x: np.convolve(x[0], [1.0, -2.0]),
+    "vander": lambda x: np.vander(x[0]),
+    "views of what is filled in": _through_views,
     "multi_dot": lambda x: np.linalg.multi_dot([W, W, x[0]]),
     "cross": lambda x: np.cross(x, [1.0, 2.0, 3.0]) + np.cross(x**2, x),
     "sum, prod, cumsum, cumprod": lambda x: (

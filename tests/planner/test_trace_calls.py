@@ -16,8 +16,8 @@ from slipcar.planner.trace.tracing import trace_call
 W = np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 4.0], [5.0, 6.0, 0.0]])
 
 
-def _trace(f, n=3, graph=None):
-    graph = graph or Graph()
+def _trace(f, n=3):
+    graph = Graph()
     return graph, trace_call("drift", f, graph.inputs("x", (1, n)))
 
 
@@ -60,15 +60,21 @@ REFUSED = {
     "argmax": (lambda x: np.argmax(x, axis=-1), "np.argmax", False),
     "argsort": (lambda x: x.argsort(), "np.argsort", False),
     "unwrap": (lambda x: np.unwrap(x), "np.unwrap", False),
-    "isclose": (lambda x: np.isclose(x, 0.0) * x, "np.isclose", False),
-    "array_equal": (lambda x: x * np.array_equal(x, W), "np.array_equal", False),
+    "array_equal": (lambda x: x * np.array_equal(x[0], W[0]), "np.array_equal", False),
+    "allclose": (lambda x: np.allclose(x, 1.0) * x, "np.allclose", False),
+    "median": (lambda x: np.median(x, axis=-1), "np.median", False),
+    "nanmax": (lambda x: np.nanmax(x, axis=-1), "np.nanmax", False),
+    "unique": (lambda x: np.unique(x), "np.unique", False),
+    "digitize": (lambda x: np.digitize(x, W[0]), "np.digitize", False),
+    "sinc": (lambda x: np.sinc(x), "np.sinc", False),
+    "add.at": (lambda x: np.add.at(x.copy(), 0, 1.0), "np.add.at", False),
+    "where=": (lambda x: np.add(x, 1.0, where=W[:1] > 1.0), "np.add", False),
     "where without values": (lambda x: np.where(x > 0), "np.where without values", False),
     "fft": (lambda x: np.fft.fft(x), "np.fft.fft", False),
     "eigenvalues": (lambda x: np.linalg.eigvals(x[..., None] * W), "np.linalg.eigvals", False),
     "large inverse": (lambda x: np.linalg.inv(np.eye(5) * x[0, 0]), "np.linalg.inv", False),
     "matrix norm": (
-        lambda x: np.linalg.norm(x[0][:, None] * W, 2), "np.linalg.norm of a matrix with ord=2",
-        False,
+        lambda x: np.linalg.norm(x[0][:, None] * W, 2), "np.linalg.norm", False,
     ),
     "searchsorted": (lambda x: np.searchsorted(W[0], x), "np.searchsorted", False),
     "nextafter": (lambda x: np.nextafter(x, 1.0), "np.nextafter", False),
@@ -181,9 +187,7 @@ def _scale(x):
     return x
 
 
-@pytest.mark.parametrize(
-    "f", [_write, _scale, lambda x: np.add(x, 1.0, out=x), lambda x: np.add.at(x, 0, 1.0)]
-)
+@pytest.mark.parametrize("f", [_write, _scale, lambda x: np.add(x, 1.0, out=x)])
 def test_writing_into_an_argument_is_refused(f):
     graph = Graph()
     x = graph.inputs("x", (1, 3))
@@ -318,11 +322,6 @@ def test_the_structure_tells_other_code_apart():
     assert len(set(keys)) == len(codes)
     g, y = _trace(lambda x: np.sin(x))
     assert g.structure(y.ravel()) != g.structure(y.ravel()[::-1])
-
-
-def test_numbers_are_constants_where_that_is_asked_for():
-    graph, _ = _trace(_car(3.0, [2.0, 6.0, 9.0]), graph=Graph(parametric=False))
-    assert graph.numbers == []
 
 
 def test_structural_numbers_are_no_parameters():

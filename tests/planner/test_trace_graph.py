@@ -12,15 +12,7 @@ from hypothesis import strategies as st
 from slipcar.planner.trace import arithmetic as op
 from slipcar.planner.trace import derivatives
 from slipcar.planner.trace.arrays import TracedArray
-from slipcar.planner.trace.graph import (
-    FUNCTIONS,
-    Graph,
-    TraceError,
-    derivative,
-    hessian,
-    jacobian,
-    reachable,
-)
+from slipcar.planner.trace.graph import FUNCTIONS, Graph, TraceError, jacobian, reachable
 from slipcar.planner.trace.numpy_code import numpy_function
 
 EPS = np.finfo(float).eps
@@ -34,6 +26,11 @@ def _traced(f, n):
     x = graph.inputs("x", (1, n)).view(TracedArray)
     result = np.asarray(f(x), dtype=object)
     return x[0], [graph.lift(value) for value in result.ravel()]
+
+
+def derivative(outputs, wrt):
+    """∂output/∂wrt for each output."""
+    return list(jacobian(np.array([*outputs], dtype=object), np.array([wrt]))[:, 0])
 
 
 def _compiled(outputs, n):
@@ -109,9 +106,6 @@ def test_first_and_second_derivatives_are_those_of_the_complex_step(name):
     np.testing.assert_allclose(got[1:3], exact[0], rtol=1e-13, atol=1e-15)
     np.testing.assert_allclose(got[3:].reshape(2, 2), bent, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(got[4], got[5], rtol=1e-12, atol=1e-14)
-    symmetric = hessian(outputs[0], symbols)
-    assert symmetric[0, 1] is symmetric[1, 0]
-    assert all(a is b for a, b in zip(symmetric[0], H[0, 0], strict=True))
 
 
 @pytest.mark.parametrize("y", [-1.3, 0.4])
@@ -134,7 +128,7 @@ def test_derivatives_of_what_is_not_analytic_are_the_closed_forms(x, y):
 
 def test_derivatives_of_the_error_function_and_the_cube_root_are_the_closed_forms():
     symbols, (f, g) = _traced(lambda x: [x[0, 0].erfc(), np.cbrt(x[0, 0])], 1)
-    H = [hessian(e, symbols)[0, 0] for e in (f, g)]
+    H = derivative(derivative([f, g], symbols[0]), symbols[0])
     x = np.array([-1.3, -0.2, 0.4, 2.0])
     got = _compiled([f, g, *derivative([f, g], symbols[0]), *H], 1)(x[:, None])
     bell = -2.0 / np.sqrt(np.pi) * np.exp(-x * x)
@@ -161,7 +155,7 @@ def test_steps_have_no_slope_and_choices_that_of_what_is_chosen():
     for step in (x > y, x >= y, x == y, x != y, op.call("sign", x), op.call("floor", x)):
         assert derivative([step], x)[0].is_zero
     c = x > y
-    assert derivative([graph.choose(c, x * y, y)], x)[0] is graph.choose(c, y, graph.constant(0.0))
+    assert derivative([op.where(c, x * y, y)], x)[0] is op.where(c, y, graph.constant(0.0))
     assert derivative([op.maximum(x, y)], x)[0] is c
 
 
@@ -205,9 +199,9 @@ def test_equal_expressions_are_one_object_however_they_are_written():
     assert np.maximum(x, x) is x
     assert (y < x) is (x > y)
     assert (x == y) is (y == x)
-    assert graph.choose(op.negation(x > y), x, y) is graph.choose(x > y, y, x)
-    assert graph.choose(graph.constant(1.0), x, y) is x
-    assert graph.choose(x > y, x, x) is x
+    assert op.where(op.negation(x > y), x, y) is op.where(x > y, y, x)
+    assert op.where(graph.constant(1.0), x, y) is x
+    assert op.where(x > y, x, x) is x
     assert (x - x).is_zero
     assert (0.0 * x).is_zero
     assert 1.0 * x is x
@@ -486,8 +480,6 @@ def test_numbers_are_an_input_and_constants_are_not():
     f = graph.number(3.0) * x
     function = numpy_function({"x": 1, "number": 4}, {"y": [f]}, frozenset({"number"}))
     assert function(x=[[2.0]], number=[graph.numbers])["y"] == 6.0
-    with pytest.raises(ValueError, match="number"):
-        graph.inputs("number", (3,))
 
 
 def test_the_structure_counts_order_operands_constants_and_names():

@@ -18,47 +18,24 @@ import numpy as np
 from slipcar.planner.convex.solvers.interface import Solution, failed
 from slipcar.planner.convex.solvers.interior_point import interior_point
 from slipcar.planner.convex.solvers.lq_problem import End, LqProblem
-from slipcar.planner.convex.subproblem import Held, Subproblem
+from slipcar.planner.convex.subproblem import Held, Pieces, Subproblem
 from slipcar.planner.lq.banded import PrimalDual
 
 Array = np.ndarray
 
 #: Solves before the interior point takes over: so many and one more for each `_NODES` nodes (the
 #: first sub-problem needs 8 at 41 nodes, 15 at 321, 20 at 481); and those it leaves for polishing.
-_SOLVES, _NODES, _POLISHING_SOLVES = 12, 16, 8
+_SOLVES, _NODES, _POLISHING_SOLVES = 16, 16, 8
 #: The terminal condition gives way by this much as its multiplier reaches ρ: keeps the matrix
 #: regular where the linearised dynamics cannot reach a direction, and ν then comes out beyond ρ.
 _TERMINAL_WIDTH = 1e-10
-
-
-class ActiveSet(NamedTuple):
-    """Which piece every piecewise quadratic is on.
-
-    Attributes:
-        hinge: hinges that push, (K, p) bool.
-        terminal: of the terminal penalty, (q,) signed: 0 inside the box, ±1 held at its side,
-            ±2 multiplier at ±ρ.
-        held: controls on the boundary of U.
-    """
-
-    hinge: Array
-    terminal: Array
-    held: Held
-
-    def same_as(self, other: ActiveSet) -> bool:
-        """Whether all are on the same pieces."""
-        return (
-            bool((self.hinge == other.hinge).all())
-            and (self.terminal is other.terminal or bool((self.terminal == other.terminal).all()))
-            and self.held.same_as(other.held)
-        )
 
 
 class _Search(NamedTuple):
     """How a search for the active set ended: its point, or None, the active set, LQ solves."""
 
     point: PrimalDual | None
-    active: ActiveSet
+    active: Pieces
     solves: int
 
 
@@ -78,7 +55,7 @@ class StructuredSolver:
         if self._held is None or not sub.limited:
             self._held = Held.nothing(*sub.r.shape)
         # Hinges on at the iterate, limits of the last solution, the terminal condition held.
-        start = ActiveSet(sub.b > 0.0, np.ones(len(sub.g), dtype=np.int64), self._held)
+        start = Pieces(sub.b > 0.0, np.ones(len(sub.g), dtype=np.int64), self._held)
         search = _newton(self._lq, start, _SOLVES + len(sub.f) // _NODES)
         if search.point is None or np.abs(search.point.terminal).max(initial=0.0) > sub.rho:
             search = _from_inside(self._lq, start, search.solves)
@@ -90,7 +67,7 @@ class StructuredSolver:
         return Solution(True, point.d, e, point.adjoint, point.terminal, objective, search.solves)
 
 
-def _newton(lq: LqProblem, start: ActiveSet, limit: int) -> _Search:
+def _newton(lq: LqProblem, start: Pieces, limit: int) -> _Search:
     """The point that lies on the pieces it was computed with."""
     sub, active, terminal = lq.sub, start, None
     for solves in range(1, limit + 1):
@@ -117,29 +94,30 @@ def _end(sub: Subproblem, terminal: Array) -> End:
     return End(held, np.where(held, softness, 1.0), side)
 
 
-def _active_set(sub: Subproblem, point: PrimalDual, before: ActiveSet | None) -> ActiveSet:
+def _active_set(sub: Subproblem, point: PrimalDual, before: Pieces | None) -> Pieces:
     """Pieces that a point lies on; it was computed on those `before`, or by the interior point."""
-    terminal = None if before is None else before.terminal
-    if terminal is None or sub.tolerance > 0.0:
-        # What is held shows no residual: its multiplier tells where it wants to go. Only the
-        # interior point puts a multiplier at its limit: doing it while the hinges are still
-        # unsettled costs many more solves.
+    if before is not None and sub.tolerance == 0.0:
+        terminal = before.terminal
+    else:
+        # What is held shows no residual: its multiplier tells where it wants to go.
         size = 1.0 + np.abs(sub.g)
         pressed = sub.G @ point.d[-1] + sub.g + point.terminal * size / sub.rho
-        sign = np.where(pressed < 0.0, -1, 1)
-        side = np.where((np.abs(pressed) > sub.tolerance) | (sub.tolerance == 0.0), sign, 0)
-        if terminal is None:
-            terminal = np.where(np.abs(pressed) > sub.tolerance + size, 2 * sign, side)
-        else:
-            terminal = np.where(np.abs(terminal) == 2, terminal, side)
+        beyond = np.abs(pressed) - sub.tolerance
+        inside = (beyond <= 0.0) & (sub.tolerance > 0.0)
+        terminal = np.where(pressed < 0.0, -1, 1) * np.where(inside, 0, 1 + (beyond > size))
+        if before is not None:
+            # Only the interior point puts a multiplier at its limit: doing it while the hinges
+            # are still unsettled costs many more solves.
+            limit = np.abs(before.terminal) == 2
+            terminal = np.where(limit, before.terminal, np.clip(terminal, -1, 1))
     if before is not None and not before.held.any and sub.strictly_inside(point.e):
         held = before.held
     else:
         held = sub.held(point.e, sub.slope(point.e, point.adjoint))
-    return ActiveSet(sub.hinge_arguments(point.d) > 0.0, terminal, held)
+    return Pieces(sub.hinge_arguments(point.d) > 0.0, terminal, held)
 
 
-def _from_inside(lq: LqProblem, start: ActiveSet, spent: int) -> _Search:
+def _from_inside(lq: LqProblem, start: Pieces, spent: int) -> _Search:
     """The interior point's solution, polished by Newton's method where that makes it better."""
     sub = lq.sub
     interior, solves = interior_point(sub, lq)
