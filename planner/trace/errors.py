@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import linecache
 import os
+import threading
 import traceback as tracebacks
 from collections.abc import Callable
 from types import TracebackType
@@ -18,6 +19,15 @@ _FOREIGN = ("scipy", "torch", "jax", "numba", "pandas", "sympy", "casadi")
 _WRAPPER = "array_api_compat"
 
 
+class Raised(threading.local):
+    """The last refusal in this thread: a function that catches it is not what it is on numbers."""
+
+    last: TraceError | None = None
+
+
+raised = Raised()
+
+
 class TraceError(TypeError):
     """The code does something with its arguments that cannot be recorded.
 
@@ -28,6 +38,7 @@ class TraceError(TypeError):
     def __init__(self, message: str, function: str = "", where: str = "") -> None:
         super().__init__(message)
         self.function, self.where = function, where
+        raised.last = self
 
 
 class OpaqueError(TraceError):

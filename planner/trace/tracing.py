@@ -38,16 +38,28 @@ def trace_call(name: str, function: Callable[..., Any], *arguments: Any) -> Trac
     try:
         with np.errstate(all="ignore"):
             try:
-                return _result(graph, function(*given))
+                return _called(graph, function, given)
             except Exception:
                 pass  # tried once more, prepared
             try:
                 with patched():
-                    return _result(graph, function(*given))
+                    return _called(graph, function, given)
             except Exception as error:
                 raise _explained(name, function, error) from error
     finally:
         graph.tracing = before
+
+
+def _called(graph: Graph, function: Callable[..., Any], given: list[Any]) -> TracedArray:
+    """What a function returns, unless it caught a refusal on the way."""
+    errors.raised.last = None
+    try:
+        value = _result(graph, function(*given))
+        if errors.raised.last is not None:
+            raise errors.raised.last
+        return value
+    finally:
+        errors.raised.last = None
 
 
 def _read_only(value: Any) -> Any:
