@@ -338,14 +338,16 @@ def _agrees(posed: Posed, constraints: bool, native: bool) -> bool:
 
 def _near(traced: Array, given: Array) -> bool:
     """Whether values are equal but for rounding; where neither is finite, they are."""
-    size, off = np.abs(given), np.abs(traced - given)
-    if (off <= _AGREEMENT * size + _ROUNDING * size.max()).all():
+    given = given.ravel()
+    off = traced.ravel() - given
+    # No entry is further off than rounding of the root mean square, itself below the largest.
+    if off.dot(off) * off.size <= _ROUNDING * _ROUNDING * given.dot(given):
         return True
     finite = np.isfinite(given)
-    if not finite.any() or not np.array_equal(finite, np.isfinite(traced)):
+    if not finite.any() or not np.array_equal(finite, np.isfinite(traced).ravel()):
         return False
-    size = size[finite]
-    return bool((off[finite] <= _AGREEMENT * size + _ROUNDING * size.max()).all())
+    size = np.abs(given[finite])
+    return bool((np.abs(off[finite]) <= _AGREEMENT * size + _ROUNDING * size.max()).all())
 
 
 @functools.lru_cache(maxsize=64)
