@@ -12,12 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from slipcar.envs.car import CONTROL_NAMES, CONTROL_UNITS
 from slipcar.evaluation.figures.scene import GREY, INK, PALETTE, PAPER, new_figure, style
 from slipcar.planner.extremal.certificate import certify
-from slipcar.planner.extremal.maximum_principle import (
-    best_step,
-    first_order,
-    hamiltonian,
-    model_for,
-)
+from slipcar.planner.extremal.maximum_principle import best_step, first_order, model_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,7 +54,7 @@ def plot_hamiltonian(plan: Any, nodes: Sequence[int] | None = None) -> Figure:
                 v = np.broadcast_to(best[k], (len(points), m)).copy()
                 v[:, j] = points
                 p = certificate.adjoint[k + 1]
-                H = hamiltonian(model, plan.times[k], plan.mean[k], p, v)
+                H = _hamiltonian(model, plan.times[k], plan.mean[k], p, v)
                 H -= H[-2]
                 label = f"$t$ = {plan.times[k]:.3g} s" if j == 0 else None
                 panels[j].plot(grid, H[:-2], color=colour, label=label)
@@ -85,6 +80,12 @@ def plot_hamiltonian(plan: Any, nodes: Sequence[int] | None = None) -> Figure:
             labels.append(name)
         figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
     return figure
+
+
+def _hamiltonian(model: Any, t: float, x: Array, p: Array, v: Array) -> Array:
+    """pᵀb(t, x, v) − vᵀRv at one node, what depends on v (points, m) in H: (points,)."""
+    b = model.drift(np.full(len(v), t), np.tile(x, (len(v), 1)), v)
+    return b @ p - np.einsum("vi,ij,vj->v", v, model.R, v)
 
 
 def _span(u: Array, best: Array, lower: float, upper: float) -> tuple[float, float]:

@@ -10,11 +10,10 @@ a saddle, leaves) at a fixed rate per direction, at times as slow as ± 0.97.
 
       z = Σ α_i (z_i + r_i),   Σ α_i = 1,   ‖Σ α_i r_i‖ least
 
-  (D. G. Anderson, 1965; Walker and Ni, 2011: GMRES on the linearised iteration). The norm is that
-  of the stopping test, ∫ ‖e‖² dt; states are combined with the weights of the controls, so that
-  the combination obeys the linearised dynamics as its members do.
+  (D. G. Anderson, 1965: GMRES on the linearised iteration), in the norm of the stopping test,
+  ∫ ‖e‖² dt; states with the same weights, to obey the linearised dynamics as all of them do.
 
-These are proposals: the caller takes them where they lower the merit function below the step's.
+The caller takes a proposal where it lowers the merit function below the step's.
 """
 
 from __future__ import annotations

@@ -25,18 +25,12 @@ import numpy as np
 from slipcar.planner.convex.acceleration import Acceleration
 from slipcar.planner.convex.merit import Iterate, Merit, iterate_at
 from slipcar.planner.convex.solvers.interface import Solution, Solver
-from slipcar.planner.convex.subproblem import Subproblem, convexify, variance_of
+from slipcar.planner.convex.subproblem import convexify, variance_of
 from slipcar.planner.convex.trust_region import Step, TrustRegion
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.problem.feasibility import (
-    FEASIBILITY,
-    inconsistency,
-    not_finite,
-    terminal_force,
-    what_lacks,
-)
+from slipcar.planner.problem import feasibility
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import Iteration
@@ -75,7 +69,7 @@ def iterate(
     options = dataclasses.replace(options, max_iterations=left)
     careful = _Attempt(model, solver, cautious, options, x, u).run()
     off_careful, off_bold = (
-        inconsistency(linearize(model, end.x, end.u), options.terminal_tolerance)
+        feasibility.inconsistency(linearize(model, end.x, end.u), options.terminal_tolerance)
         for end in (careful, bold)
     )
     better = careful.status in (Status.CONVERGED, Status.STOPPED) or off_careful < off_bold
@@ -86,30 +80,24 @@ def iterate(
 
 @dataclasses.dataclass(frozen=True)
 class _Proposal:
-    """A sub-problem and its solution; Δ and −p¹ of its trust region, ∫ ‖u_{k+1} − u_k‖² dt.
+    """A sub-problem's solution."""
 
-    The radius is ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts.
-    """
-
-    sub: Subproblem
     solution: Solution
-    radius: float
-    multiplier: float
-    step: float
+    lacking: float  # its virtual control
+    radius: float  # ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts
+    multiplier: float  # of the trust region, −p¹
+    step: float  # ∫ ‖u_{k+1} − u_k‖² dt
 
 
 @dataclasses.dataclass(frozen=True)
 class _Candidate:
-    """Where a proposal leads: Φ there and before, its decrease by the model and in fact.
-
-    The decrease is −∞ where something is not finite.
-    """
+    """What the non-linear problem makes of a proposal."""
 
     at: Iterate
     merit: float
-    before: float
-    predicted: float
-    actual: float
+    before: float  # Φ at the iterate
+    predicted: float  # decrease of Φ by the model
+    actual: float  # decrease of Φ, −∞ where something is not finite
 
 
 class _Attempt:
@@ -125,10 +113,10 @@ class _Attempt:
         self.linearize_seconds = time.perf_counter() - clock
         lin = self.at.lin
         if not lin.finite:
-            raise ValueError(f"{not_finite(lin)} is not finite along the guess")
+            raise ValueError(f"{feasibility.not_finite(lin)} is not finite along the guess")
         self.adjoint, self.terminal = np.zeros(lin.defect.shape), np.zeros(lin.g.shape)
         self.trust_multiplier = 0.0
-        self.rho = self.first_rho = _FIRST_RHO * max(1.0, terminal_force(model, lin))
+        self.rho = self.first_rho = _FIRST_RHO * max(1.0, feasibility.terminal_force(model, lin))
         self.raises, self.lacked, self.last_step = 0, np.inf, np.inf
         self.acceleration = Acceleration(model.dt)
         self.history: list[Iteration] = []
@@ -187,7 +175,7 @@ class _Attempt:
             )  # fmt: skip
             solution = self.solver.solve(sub)
             if not solution.found:
-                return _Proposal(sub, solution, np.nan, multiplier, np.nan)
+                return _Proposal(solution, np.nan, np.nan, multiplier, np.nan)
             d = solution.d
             if weight is None:
                 radius = float(np.vdot(model.dt[:, None] * d, d))
@@ -196,7 +184,7 @@ class _Attempt:
             if trust.fits(radius):
                 break
         step = float(np.vdot(model.dt[:, None] * solution.e, solution.e))
-        return _Proposal(sub, solution, radius, multiplier, step)
+        return _Proposal(solution, sub.virtual_control(d), radius, multiplier, step)
 
     def trust_weight(self) -> Array:
         """Hessian blocks of ∫ E‖x − x_k‖² dt: those of the variance penalty, but for its weight."""
@@ -240,10 +228,9 @@ class _Attempt:
         return new
 
     def limit_controls(self, proposal: _Proposal, new: _Candidate, accepted: bool) -> bool:
-        """Let control bounds act once steps are short.
+        """Let bounds act once steps are short; whether they take this one back.
 
-        Returns:
-            True for a step that the bounds take back: it says nothing of convergence.
+        Such a step says nothing of convergence.
         """
         u = new.at.lin.u
         if self.relaxed is None:
@@ -258,8 +245,8 @@ class _Attempt:
         """Go to the new iterate; CONVERGED or INFEASIBLE if the iteration has settled there."""
         self.at, self.trust_multiplier = new.at, proposal.multiplier
         self.adjoint, self.terminal = proposal.solution.adjoint, proposal.solution.terminal
-        lacking = proposal.sub.virtual_control(proposal.solution.d)
-        feasible = lacking <= FEASIBILITY * self.size
+        lacking, size = proposal.lacking, self.size
+        feasible = lacking <= feasibility.FEASIBILITY * size
         # Where a trust region is needed to the end, a short step proves nothing by itself:
         # the force it stands for, p¹ (x − x_k), must vanish too (beside that of the terminal
         # penalty, where it is at its limit).
@@ -267,8 +254,10 @@ class _Attempt:
         step += force**2 * proposal.radius
         settled = step + self.last_step <= self.options.tolerance
         self.last_step = step
+        if not settled:
+            return None
         tau = self.options.terminal_tolerance
-        if not (settled and inconsistency(self.at.lin, tau, lacking) <= _CONSISTENCY * self.size):
+        if not feasibility.inconsistency(self.at.lin, tau, lacking) <= _CONSISTENCY * size:
             return None
         if feasible:
             return Status.CONVERGED
@@ -295,7 +284,7 @@ class _Attempt:
             variance=np.nan if variance is None else variance.total / self.options.variance_weight,
             merit=new.merit, predicted=new.predicted, actual=new.actual, step=proposal.step,
             trust_radius=proposal.radius, trust_multiplier=proposal.multiplier,
-            virtual_control=proposal.sub.virtual_control(solution.d),
+            virtual_control=proposal.lacking,
             defect=float(np.abs(lin.defect).max()),
             terminal_residual=float(np.abs(lin.g).max(initial=0.0)),
             terminal_multiplier=solution.terminal,
@@ -307,7 +296,7 @@ class _Attempt:
         """What has been reached, with controls that are admissible however it ended."""
         model, weight, lin = self.model, self.options.variance_weight, self.at.lin
         if status is Status.INFEASIBLE:
-            message = what_lacks(lin, self.options.terminal_tolerance, self.size)
+            message = feasibility.what_lacks(lin, self.options.terminal_tolerance, self.size)
         if not status.ok and not np.array_equal(inside := model.admissible(lin.u), lin.u):
             lin = linearize(model, lin.x, inside)
         return Outcome.at(

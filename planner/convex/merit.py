@@ -66,7 +66,7 @@ class Merit:
         lin, beyond = at.lin, self._beyond(at.lin.g)
         defects = np.vdot(self.adjoint, lin.defect) + 0.5 * self._largest * np.abs(lin.defect).sum()
         end = np.vdot(self._nu, beyond) + self._terminal_price * np.abs(beyond).sum()
-        return at.smooth_cost + lin.penalty + float(defects) + float(end)
+        return at.smooth_cost + lin.penalty + float(defects + end)
 
     @_quiet
     def lagrangian(self, at: Iterate) -> float:

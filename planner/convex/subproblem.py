@@ -33,57 +33,27 @@ from slipcar.planner.problem.model import Model
 Array = np.ndarray
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Held:
-    """Which controls are held on the boundary of U: at bounds (K, m), on spheres (K,).
-
-    Spheres are touched in directions `turn` (K, m) with multipliers `press` (K,); zero where off.
-    """
-
-    lower: Array
-    upper: Array
-    on: Array
-    turn: Array
-    press: Array
-
-    @classmethod
-    def nothing(cls, K: int, m: int) -> Held:
-        """No control is held."""
-        off, zeros = np.zeros((K, m), dtype=bool), np.zeros((K, m))
-        return cls(off, off, off[:, 0], zeros, zeros[:, 0])
-
-    @property
-    def any(self) -> bool:
-        """Whether any control is held."""
-        return bool(self.lower.any() or self.upper.any() or self.on.any())
-
-    def same_as(self, other: Held) -> bool:
-        """Whether the same controls are held, and along the same tangents."""
-        return self is other or bool(
-            (self.lower == other.lower).all()
-            and (self.upper == other.upper).all()
-            and (self.on == other.on).all()
-            and np.abs(self.turn - other.turn).max() <= 1e-9
-            and np.abs(self.press - other.press).max() <= 1e-6 * (1.0 + self.press.max())
-        )
-
-
 class Pieces(NamedTuple):
-    """Which piece every kink is on: hinges that push (K, p) bool, terminal rows (q,), controls.
+    """Which piece every kink of a sub-problem is on."""
 
-    Of the terminal penalty: 0 inside the box, ±1 held at its side, ±2 multiplier at ±ρ.
-    """
-
-    hinge: Array
-    terminal: Array
-    held: Held
+    hinge: Array  # hinges that push, (K, p) bool
+    terminal: Array  # (q,): 0 inside the box, ±1 held at its side, ±2 multiplier at ±ρ
+    lower: Array  # controls held at their bounds, (K, m) bool
+    upper: Array
+    on: Array  # controls held on spheres, (K,) bool
+    turn: Array  # directions t in which spheres are touched, (K, m); zero where off
+    press: Array  # multipliers μ ≥ 0 of spheres, (K,)
+    hold: bool = False  # whether any control is held
 
     def same_as(self, other: Pieces) -> bool:
-        """Whether all are on the same pieces."""
-        return (
-            bool((self.hinge == other.hinge).all())
-            and (self.terminal is other.terminal or bool((self.terminal == other.terminal).all()))
-            and self.held.same_as(other.held)
+        """Whether all are on the same pieces, and spheres touched alike."""
+        masks = zip(self[:5], other[:5], strict=True)
+        return all(a is b or bool((a == b).all()) for a, b in masks) and bool(
+            self.turn is other.turn
+            or (
+                np.abs(self.turn - other.turn).max() <= 1e-9
+                and np.abs(self.press - other.press).max() <= 1e-6 * (1.0 + self.press.max())
+            )
         )
 
 
@@ -133,10 +103,10 @@ class Subproblem:
         value += 0.5 * np.vdot(self.h, hinge * hinge)
         return float(value) + self.rho * self.virtual_control(d)
 
-    def slope(self, e: Array, adjoint: Array) -> Array:
-        """Gradient with respect to the controls at e, R e + r + Bᵀλ, (K, m)."""
-        bent = np.matmul(self.R, e[..., None])[..., 0]
-        return bent + self.r + np.matmul(adjoint[:, None], self.B)[:, 0]
+    def slope(self, adjoint: Array, e: Array | None = None) -> Array:
+        """Gradient by the controls at e (None is 0), R e + r + Bᵀλ for λ_1..λ_K (K, n): (K, m)."""
+        slope = self.r + np.matmul(adjoint[:, None], self.B)[:, 0]
+        return slope if e is None else slope + np.matmul(self.R, e[..., None])[..., 0]
 
     def response(self, e: Array) -> Array:
         """Deviations of nodes 1..K under control deviations e (K, m): (K, n)."""
@@ -186,46 +156,49 @@ class Subproblem:
         D = np.einsum("kii->ki", self.R)
         return e - slope / (D.max(axis=1, keepdims=True) if self.radius < np.inf else D)
 
-    def held(self, e: Array, slope: Array) -> Held:
-        """Which part of the boundary the projection of :meth:`wanted` lies on."""
-        K, m = e.shape
+    def free(self, hinge: Array, terminal: Array) -> Pieces:
+        """These pieces with no control held."""
+        off, zeros = np.zeros(self.r.shape, dtype=bool), np.zeros(self.r.shape)
+        return Pieces(hinge, terminal, off, off, off[:, 0], zeros, zeros[:, 0])
+
+    def pieces(self, hinge: Array, terminal: Array, e: Array, slope: Array) -> Pieces:
+        """These pieces, and where on the boundary of U the projection of :meth:`wanted` lies."""
         u, wanted = e - self.center, self.wanted(e, slope) - self.center
         low, high = self.lower - self.center, self.upper - self.center
         nearest = self._nearest(wanted) if self.radius < np.inf else np.clip(wanted, low, high)
         # What is at one side and wants to the other is released.
         lower, upper = (nearest <= low) & (u < high), (nearest >= high) & (u > low)
+        pieces = self.free(hinge, terminal)._replace(lower=lower, upper=upper)
         if self.radius == np.inf:
-            return dataclasses.replace(Held.nothing(K, m), lower=lower, upper=upper)
+            return pieces._replace(hold=bool(lower.any() or upper.any()))
         # On a sphere what is free of the box is shrunk by 1 + μ/(r D) to come there.
-        free = ~(lower | upper)
-        shrunk, size, whole = (
-            np.linalg.norm(np.where(mask, v, 0.0), axis=1)
-            for mask, v in ((free, nearest), (free, wanted), (True, u))
-        )
+        free, size = ~(lower | upper), np.linalg.norm(u, axis=1)
+        shrunk, whole = (np.linalg.norm(np.where(free, v, 0.0), axis=1) for v in (nearest, wanted))
         outwards = np.einsum("ki,ki->k", u, wanted) > 0.0
-        on = (size > shrunk) & (shrunk > 1e-6 * self.radius) & outwards
+        on = (whole > shrunk) & (shrunk > 1e-6 * self.radius) & outwards
         D = np.einsum("kii->ki", self.R).max(axis=1)
-        press = self.radius * D * (size / np.where(on, shrunk, 1.0) - 1.0)
-        turn = u / np.where(on, whole, 1.0)[:, None]
-        return Held(lower, upper, on, np.where(on[:, None], turn, 0.0), np.where(on, press, 0.0))
+        press = self.radius * D * (whole / np.where(on, shrunk, 1.0) - 1.0)
+        turn = np.where(on[:, None], u / np.where(on, size, 1.0)[:, None], 0.0)
+        hold = bool((lower | upper | on[:, None]).any())
+        return pieces._replace(on=on, turn=turn, press=np.where(on, press, 0.0), hold=hold)
 
-    def free_controls(self, held: Held, H: Array, r: Array) -> tuple[Array, Array]:
+    def held_controls(self, pieces: Pieces, H: Array, r: Array) -> tuple[Array, Array]:
         """M and e⁰ of :mod:`slipcar.planner.lq.banded`, for the cost ½ eᵀHe + rᵀe of controls.
 
         A sphere holds tᵀu = radius and adds the curvature ½ (μ/radius) uᵀ(I − t tᵀ)u.
         """
         eye = np.eye(H.shape[1])
-        box = ~(held.lower | held.upper)
+        box = ~(pieces.lower | pieces.upper)
         P = box[..., None] * eye  # onto what is free
-        fixed = np.where(held.lower, self.lower, np.where(held.upper, self.upper, 0.0))
-        if held.on.any():
-            t, normal = held.turn, np.where(box, held.turn, 0.0)
-            length = np.where(held.on, np.einsum("ki,ki->k", normal, normal), 1.0)[:, None]
-            short = held.on * self.radius + np.einsum("ki,ki->k", t, self.center - fixed)
+        fixed = np.where(pieces.lower, self.lower, np.where(pieces.upper, self.upper, 0.0))
+        if pieces.on.any():
+            t, normal = pieces.turn, np.where(box, pieces.turn, 0.0)
+            length = np.where(pieces.on, np.einsum("ki,ki->k", normal, normal), 1.0)[:, None]
+            short = pieces.on * self.radius + np.einsum("ki,ki->k", t, self.center - fixed)
             fixed = fixed + normal / length * short[:, None]
             P = P - normal[:, :, None] * (normal / length)[:, None, :]
             across = eye - t[:, :, None] * t[:, None, :]
-            curvature = (held.press / self.radius)[:, None, None] * across
+            curvature = (pieces.press / self.radius)[:, None, None] * across
             H, r = H + curvature, r - np.matmul(curvature, self.center[..., None])[..., 0]
         M = np.linalg.inv(P @ H @ P + (eye - P)) - (eye - P)
         pull = r + np.matmul(H, fixed[..., None])[..., 0]
@@ -256,17 +229,10 @@ def convexify(
     rho: float = 1.0,
     tolerance: float = 0.0,
 ) -> Subproblem:
-    """The sub-problem at an iterate.
+    """The sub-problem at an iterate, with its variance of :func:`variance_of`.
 
-    Args:
-        model: the problem.
-        at: its linearisation.
-        variance: of :func:`variance_of`.
-        composite: keep φ = max(0, ·)² and linearise its argument; otherwise linearise L.
-        trust_multiplier: weight of ∫ E‖x − x_k‖² (−p¹ of the paper), ≥ 0.
-        trust_weight: Hessian blocks of that integral, (K, n, n); needed if the weight is > 0.
-        rho: weight of the exact terminal penalty.
-        tolerance: half-width of the terminal box, 0 for equality.
+    `composite` keeps φ = max(0, ·)² and linearises its argument; otherwise L is linearised. A trust
+    region has the multiplier −p¹ ≥ 0 and the Hessian blocks of its integral, (K, n, n).
     """
     K, n = at.defect.shape
     two_dt = 2.0 * model.dt

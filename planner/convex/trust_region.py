@@ -23,35 +23,22 @@ _NEGLIGIBLE = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """What a schedule judges a step by.
+    """What a schedule judges a step by."""
 
-    Attributes:
-        radius: ∫ E‖x − x_k‖² dt that the step takes.
-        predicted: decrease of the merit function by the convex model, ≥ 0.
-        actual: decrease of the merit function; −inf where the model functions are not finite.
-        before: merit function at the current iterate.
-    """
-
-    radius: float
-    predicted: float
-    actual: float
-    before: float
+    radius: float  # ∫ E‖x − x_k‖² dt that the step takes
+    predicted: float  # decrease of the merit function by the convex model, ≥ 0
+    actual: float  # decrease of the merit function; −inf where something is not finite
+    before: float  # merit function at the current iterate
 
 
 class TrustRegion:
-    """A schedule of trust regions; as it stands every step is taken whole.
+    """A schedule of trust regions; as it stands every step is taken whole."""
 
-    Attributes:
-        multiplier: weight to solve the next sub-problem with.
-        bold: whether the next step may be long and is not judged; control bounds may then wait.
-        collapsed: whether no acceptable step is to be expected any more.
-        limits_radius: whether `fits` looks at the radius, which must then be measured in full
-            even while the multiplier is zero.
-        accelerates: whether steps may be lengthened or combined where they converge slowly.
-    """
-
-    multiplier, bold, collapsed = 0.0, False, False
-    limits_radius, accelerates = False, False
+    multiplier = 0.0  # weight to solve the next sub-problem with
+    bold = False  # the next step may be long and is not judged; control bounds may then wait
+    collapsed = False  # no acceptable step is to be expected any more
+    limits_radius = False  # `fits` looks at the radius: measure it in full, whatever the multiplier
+    accelerates = False  # steps may be lengthened or combined where they converge slowly
 
     def cautious(self, multiplier: float) -> TrustRegion | None:
         """A fresh schedule for a second attempt whose steps are short from the first, if any."""

@@ -5,7 +5,7 @@ certificate (how far it is from an extremal), or the extremal near it.
 
     :mod:`.maximum_principle`  λ_k = ∇ℓ_k + A_kᵀλ_{k+1},  u = argmax_U H,  and scales for residuals
     :mod:`.certificate`        every condition's residual, and p⁰_k ≠ 0 along the iteration
-    :mod:`.conditions`         the same as equations F(x, u, λ, ν) = 0
-    :mod:`.newton_step`        Newton's step on them, with :mod:`.second_order`
+    :mod:`.conditions`         the same as equations F(x, u, λ, ν) = 0, and Newton's step on them,
+                               with second derivatives by :mod:`.second_order`
     :mod:`.shooting`           Newton's iteration from an iterate of SCP (§3.3)
 """

@@ -44,26 +44,15 @@ _quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @dataclasses.dataclass(frozen=True)
 class Violations:
-    """How far a trajectory with multiplier 𝔭 is from the maximum principle, in its own units.
-
-    Attributes:
-        at: first derivatives there.
-        dynamics: largest |F_k(x_k, u_k) − x_{k+1}|.
-        terminal: largest |g(x_K)| beyond its tolerance.
-        control: largest |argmax_U H_k − u_k|, p from the adjoint recursion.
-        hamiltonian: largest max_U H_k − H_k(u_k) ≥ 0.
-        bounds: largest distance of a u_k from U.
-        adjoint: λ_1..λ_K = −p_1..−p_K by the recursion, (K, n).
-        scales: what counts as one.
-    """
+    """How far a trajectory with multiplier 𝔭 is from the maximum principle, in its own units."""
 
     at: FirstOrder
-    dynamics: float
-    terminal: float
-    control: float
-    hamiltonian: float
-    bounds: float
-    adjoint: Array
+    dynamics: float  # largest |F_k(x_k, u_k) − x_{k+1}|
+    terminal: float  # largest |g(x_K)| beyond its tolerance
+    control: float  # largest |argmax_U H_k − u_k|, p from the adjoint recursion
+    hamiltonian: float  # largest max_U H_k − H_k(u_k) ≥ 0
+    bounds: float  # largest distance of a u_k from U
+    adjoint: Array  # λ_1..λ_K = −p_1..−p_K by the recursion, (K, n)
     scales: Scales
 
     @property
@@ -232,6 +221,7 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
     if not (np.isfinite(tolerance) and tolerance > 0.0):
         raise ValueError(f"tolerance must be finite and > 0, not {tolerance!r}")
     model, own, weight = model_for(plan), plan.multipliers, plan.options["variance_weight"]
+    q = len(own.terminal)
     broken = violations(
         model, plan.mean, plan.controls, -own.terminal,
         variance_weight=weight, terminal_tolerance=plan.options["terminal_tolerance"],
@@ -249,7 +239,7 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
     rate = (lin.effort + lin.penalty) / (model.times[-1] - model.times[0])
     return Certificate(
         plan.status, own.normalized(),
-        terminal_history=np.reshape([h.terminal for h in history], (-1, len(own.terminal))),
+        terminal_history=np.reshape([h.terminal for h in history], (len(history), q)),
         cost_history=np.array([h.cost for h in history]),
         trust_region_history=np.array([h.trust_region for h in history]),
         relaxed=lacking > _RELAXED * broken.scales.state,

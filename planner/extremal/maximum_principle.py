@@ -48,17 +48,11 @@ def model_for(plan: Any) -> Model:
 
 @dataclasses.dataclass(frozen=True)
 class FirstOrder:
-    """First derivatives along a trajectory.
-
-    Attributes:
-        lin: the model and its Jacobians there.
-        weights: Λ_1..Λ_K of the variance penalty, (K, n, n), or None for w = 0.
-        sub: the sub-problem there, without a trust region: its gradients are those of the costs.
-    """
+    """First derivatives along a trajectory: those of costs are the sub-problem's."""
 
     lin: Linearization
-    weights: Array | None
-    sub: Subproblem
+    weights: Array | None  # Λ_1..Λ_K of the variance penalty, (K, n, n); None for w = 0
+    sub: Subproblem  # without a trust region
 
     @property
     def push(self) -> Array:
@@ -69,10 +63,6 @@ class FirstOrder:
     def state_gradient(self) -> Array:
         """∇ℓ at nodes 1..K, (K, n)."""
         return self.sub.q + np.matmul(self.push[:, None], self.sub.a)[:, 0]
-
-    def slope(self, adjoint: Array) -> Array:
-        """Gradient by u of cost and dynamics, B_kᵀ λ_{k+1} + ..., for λ_1..λ_K (K, n): (K, m)."""
-        return self.sub.r + np.matmul(adjoint[:, None], self.sub.B)[:, 0]
 
 
 def first_order(
@@ -102,7 +92,7 @@ def best_step(model: Model, at: FirstOrder, adjoint: Array) -> tuple[Array, Arra
     H is quadratic in u for dynamics affine in it; otherwise this is its quadratic model at u,
     whose argmax is u itself exactly when u is stationary for H.
     """
-    slope = at.slope(adjoint)
+    slope = at.sub.slope(adjoint)
     e = minimize_over_controls(model, at.sub.R, slope, at.lin.u)
     bent = np.matmul(at.sub.R, e[..., None])[..., 0]
     return e, -np.einsum("ki,ki->k", e, slope + 0.5 * bent) / model.dt
@@ -152,17 +142,11 @@ def _minimize_over_box(R: Array, r: Array, lower: Array, upper: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Scales:
-    """What counts as one in each residual, in the problem's own units.
+    """What counts as one in each residual, in the problem's own units."""
 
-    Attributes:
-        state: 1 + max |x|, for defects and the terminal residual.
-        control: max |u|; at least what moves the state by 1e-3 of its scale over the horizon.
-        adjoint: max |λ|; at least what such a control would answer to.
-    """
-
-    state: float
-    control: float
-    adjoint: float
+    state: float  # 1 + max |x|, for defects and the terminal residual
+    control: float  # max |u|; at least what moves the state by 1e-3 of its scale over the horizon
+    adjoint: float  # max |λ|; at least what such a control would answer to
 
 
 def scales(at: FirstOrder, adjoint: Array) -> Scales:
@@ -173,17 +157,6 @@ def scales(at: FirstOrder, adjoint: Array) -> Scales:
     answer = float(np.max(np.abs(at.sub.R))) * control / max(float(reach.max()), 1e-300)
     control = max(float(np.max(np.abs(at.lin.u))), control)
     return Scales(state, control, max(float(np.max(np.abs(adjoint))), answer))
-
-
-def hamiltonian(model: Model, t: Array, x: Array, p: Array, u: Array) -> Array:
-    """H up to what does not depend on u, pᵀb(t, x, u) − uᵀRu, batched over leading axes.
-
-    p (..., n) are the adjoints at the ends of the intervals, p⁰ = −1.
-    """
-    batch = np.broadcast_shapes(np.shape(t), x.shape[:-1], u.shape[:-1])
-    t, u = np.broadcast_to(t, batch), np.broadcast_to(u, (*batch, u.shape[-1]))
-    b = model.drift(t, np.broadcast_to(x, (*batch, x.shape[-1])), u)
-    return np.einsum("...i,...i->...", p, b) - np.einsum("...i,ij,...j->...", u, model.R, u)
 
 
 def time_slope(model: Model, at: FirstOrder, adjoint: Array, variance_weight: float) -> float:

@@ -26,21 +26,13 @@ _STEP = 6e-6
 
 @dataclasses.dataclass(frozen=True)
 class SecondOrder:
-    """Hessian blocks of the Lagrangian, Λ of the variance penalty and the slopes of φ held.
+    """Hessian blocks of the Lagrangian, Λ of the variance penalty and the slopes of φ held."""
 
-    Attributes:
-        xx: nodes 1..K, (K, n, n).
-        ux: at nodes 0..K−1, (K, m, n).
-        uu: (K, m, m).
-        A_x: ∂A_k/∂x_k, (K, n, n, n), last axis the state that is differentiated.
-        A_u: ∂A_k/∂u_k, (K, n, n, m).
-    """
-
-    xx: Array
-    ux: Array
-    uu: Array
-    A_x: Array
-    A_u: Array
+    xx: Array  # nodes 1..K, (K, n, n)
+    ux: Array  # nodes 0..K−1, (K, m, n)
+    uu: Array  # (K, m, m)
+    A_x: Array  # ∂A_k/∂x_k, (K, n, n, n), last axis the state that is differentiated
+    A_u: Array  # ∂A_k/∂u_k, (K, n, n, m)
 
 
 def second_order(

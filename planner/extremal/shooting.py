@@ -2,15 +2,10 @@
 
 Late iterates of SCP carry multipliers close to those of the extremal they converge to (Theorem
 3.4). From there the two-point boundary value problem of :mod:`.maximum_principle` is solved by
-Newton's method: quadratic, where SCP is linear.
-
-All states and adjoints are unknowns (multiple shooting), and each step is a banded solve
-(:mod:`.newton_step`). Condensed to the n unknowns 𝔭 of single shooting it would cost the same;
-but single shooting integrates the canonical equations, hinges and all, from end to end before
-it looks at a residual: from iterates with a residual of 0.01 to 0.1 it converged in 18 % of
-attempts and this in 93 %, from 0.001 to 0.01 in 54 % and 99 % (40 random worlds, w = 0). The
-variance penalty's Λ is that of the current point, and its change with the trajectory is part of
-the step.
+Newton's method: quadratic, where SCP is linear. All states and adjoints are unknowns (multiple
+shooting), and each step is a banded solve (:mod:`.conditions`). Single shooting, with the n
+unknowns 𝔭, would cost the same but converges from far fewer iterates: from those with a residual
+of 0.01 to 0.1 in 18 % of attempts and this in 93 % (40 random worlds, w = 0).
 
 Every step must reduce the residual, shortened a few times if need be; otherwise the attempt ends,
 typed, with nothing lost: SCP goes on from where it was.
@@ -50,23 +45,14 @@ _quiet = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @dataclasses.dataclass(frozen=True)
 class ShotIteration:
-    """A point of the Newton iteration; the first is where it started.
+    """A point of the Newton iteration; the first is where it started."""
 
-    Attributes:
-        mean: (N, n).
-        controls: (K, m).
-        terminal_multiplier: ν, (q,).
-        residual: largest residual of the conditions, relative to :class:`Scales`.
-        step: length of the step that led here, in (0, 1]; 0 for the first.
-        seconds: since the attempt began.
-    """
-
-    mean: Array
-    controls: Array
-    terminal_multiplier: Array
-    residual: float
-    step: float
-    seconds: float
+    mean: Array  # (N, n)
+    controls: Array  # (K, m)
+    terminal_multiplier: Array  # ν, (q,)
+    residual: float  # largest of the conditions, relative to its scale
+    step: float  # length of the step that led here, in (0, 1]; 0 for the first
+    seconds: float  # since the attempt began
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,8 +122,7 @@ def shoot(
         terminal_tolerance: half-width of the terminal box, 0 for equality.
         tolerance: largest relative residual to call it converged.
         max_iterations: at most so many Newton steps.
-        start_within: give up at once if the first residual is larger: an iterate so far away
-            is better improved by SCP.
+        start_within: give up at once if the first residual is larger, and SCP is better.
     """
     began = time.perf_counter()
     start = first_order(model, x, u, variance_weight)

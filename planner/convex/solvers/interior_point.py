@@ -6,13 +6,12 @@ s z = μ → 0; linearised and eliminated, each only adds to the LQ problem's di
 
 * bounds: R gets z/s, r the rest;
 * balls, in the form s + (‖u‖² − r²)/(2r) = 0: R gets (z/s) t tᵀ + (z/r) I with t = u/r;
-* hinges ½ h t², t ≥ c, t ≥ 0: a weight on their row;
 * the terminal slacks of the exact penalty and the box round the condition: softness δ of its
   row, G d − δ ν = s.
 
-μ falls the faster the longer the last step was. A hinge that is off has t and its multiplier
-both vanish, which makes the end linear rather than superlinear: the method stops at a gap of
-1e-9 of the objective and leaves the last digits to Newton's method.
+Hinges are no inequalities: each step takes them as they are on at the last point. μ falls the
+faster the longer the last step was; the method stops at a gap of 1e-9 of the objective and leaves
+the last digits to Newton's method.
 """
 
 from __future__ import annotations
@@ -38,8 +37,6 @@ class _ByKind(NamedTuple):
 
     lower: Array  # bounds on e, (K, m)
     upper: Array
-    above: Array  # t − c of the hinges, (K, p)
-    t: Array
     plus: Array  # terminal slack s⁺, its multiplier ρ − ν, (q,)
     minus: Array
     high: Array  # τ − w of the terminal box, (q,)
@@ -126,24 +123,15 @@ def _start(sub: Subproblem) -> tuple[_ByKind, _State]:
         shrunk = np.minimum(within, 1.0) * u + sub.center
         e = shrunk if ((sub.lower < shrunk) & (shrunk < sub.upper)).all() else e
     d = sub.response(e)
-    c, residual = sub.hinge_arguments(d), sub.G @ d[-1] + sub.g
-    t, size = np.maximum(c, 0.0) + 1.0, 1.0 + np.abs(residual)
+    residual = sub.G @ d[-1] + sub.g
+    size = 1.0 + np.abs(residual)
     box = np.full(q, sub.tolerance if sub.tolerance > 0.0 else np.inf)
-    s = _ByKind(
-        lower=e - sub.lower,
-        upper=sub.upper - e,
-        above=t - c,
-        t=t,
-        plus=np.maximum(residual, 0.0) + size,
-        minus=np.maximum(-residual, 0.0) + size,
-        high=box,
-        low=box,
-        ball=np.maximum(-_passed(sub, e), 0.1 * sub.radius) if balls else np.zeros(0),
-    )
-    # Multipliers of one where nothing else is known.
-    pull, rho = 0.5 * sub.h * t + 1e-6, np.full(q, sub.rho)
-    one = _ByKind(*(np.where(np.isfinite(slack), 1.0, 0.0) for slack in s))
-    z = one._replace(above=pull, t=pull, plus=rho, minus=rho)
+    ball = np.maximum(-_passed(sub, e), 0.1 * sub.radius) if balls else np.zeros(0)
+    plus, minus = np.maximum(residual, 0.0) + size, np.maximum(-residual, 0.0) + size
+    s = _ByKind(e - sub.lower, sub.upper - e, plus, minus, box, box, ball)
+    # The multipliers of slacks are ρ ∓ ν; one where nothing is known.
+    z = _ByKind(*(np.where(np.isfinite(slack), 1.0, 0.0) for slack in s))
+    z = z._replace(plus=np.full(q, sub.rho), minus=np.full(q, sub.rho))
     point = PrimalDual(d, e, np.zeros_like(d), np.zeros(q))
     return s, _State(s.flat(), z.flat(), point, np.zeros(q))
 
@@ -164,11 +152,7 @@ def _direction(
     s, z = kinds.split(state.s), kinds.split(state.z)
     stiff, push = kinds.split(state.z / state.s), kinds.split(mu / state.s)
     (d, e, _, nu), w = state.point, state.w
-    # Hinges: Δt = (rest + z/s Δc)/D, which leaves a weight ω on the row.
-    D = sub.h + stiff.above + stiff.t
-    rest = push.above + push.t - sub.h * s.t
-    omega = stiff.above * (sub.h + stiff.t) / D
-    force = push.above - stiff.above * rest / D - omega * (s.t - s.above - sub.b)
+    weight = sub.h * (sub.hinge_arguments(d) > 0.0)
     # The terminal slacks soften their row, and so does the box, Δw = ν / (z/s) + lean.
     soft = s.plus / z.plus + s.minus / z.minus
     side = -sub.g + mu / z.plus - mu / z.minus - soft * nu
@@ -178,12 +162,10 @@ def _direction(
         lean = (push.low - push.high) * inverse
         soft, side = soft + inverse, side + w + lean
     end = End(np.ones(len(w), dtype=bool), soft, side)
-    target = lq.solve(omega, force, end, _controls(sub, e, s, z, stiff, push))
+    target = lq.solve(weight, weight * sub.b, end, _controls(sub, e, s, z, stiff, push))
     if target is None:
         return None
     de, dw = target.e - e, target.terminal * inverse + lean
-    dc = np.matmul(sub.a, (target.d - d)[..., None])[..., 0]
-    dt = (rest + stiff.above * dc) / D
     ball = s.ball
     if ball.size:
         ball = -s.ball - _passed(sub, e) - np.sum((e - sub.center) * de, axis=1) / sub.radius
@@ -193,10 +175,7 @@ def _direction(
     # difference, and dividing by it would lose all digits.
     residual, larger = sub.G @ target.d[-1] + sub.g - w - dw, s.plus >= s.minus
     plus, minus = np.where(larger, residual + minus, plus), np.where(larger, minus, plus - residual)
-    moves = _ByKind(
-        lower=de, upper=-de, above=dt - dc, t=dt, plus=plus - s.plus, minus=minus - s.minus,
-        high=-dw, low=dw, ball=ball,
-    )  # fmt: skip
+    moves = _ByKind(de, -de, plus - s.plus, minus - s.minus, -dw, dw, ball)
     ds = np.where(np.isfinite(state.s), moves.flat(), 0.0)
     dz = (mu - state.z * ds) / state.s - state.z  # s z = μ, linearised
     change = kinds.split(dz)

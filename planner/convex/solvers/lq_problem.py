@@ -21,10 +21,7 @@ class End(NamedTuple):
 
 
 class LqProblem:
-    """LQ problems of one sub-problem; what its pieces do not change is computed once.
-
-    Sizes: K intervals, n states, q terminal conditions.
-    """
+    """LQ problems of one sub-problem; what its pieces do not change is computed once."""
 
     def __init__(self, K: int, n: int, q: int) -> None:
         self._lq = BandedLq(K, n, q)

@@ -21,6 +21,13 @@ from slipcar.planner.convex.subproblem import Subproblem
 Array = np.ndarray
 
 
+#: Polishing finds the last digits once the active set is right.
+_SETTINGS: dict[str, Any] = {
+    "eps_abs": 1e-6, "eps_rel": 1e-6, "polishing": True, "check_dualgap": False,
+    "rho": 1.0, "max_iter": 20_000, "verbose": False,
+}  # fmt: skip
+
+
 class OsqpSolver:
     """Solver for sub-problems of one shape; keeps OSQP's workspace and its last point.
 
@@ -28,17 +35,7 @@ class OsqpSolver:
     """
 
     def __init__(self, **settings: object) -> None:
-        self._settings = {
-            # Polishing finds the last digits once the active set is right.
-            "eps_abs": 1e-6,
-            "eps_rel": 1e-6,
-            "polishing": True,
-            "check_dualgap": False,
-            "rho": 1.0,
-            "max_iter": 20_000,
-            "verbose": False,
-            **settings,
-        }
+        self._settings = {**_SETTINGS, **settings}
         self._programme: _Programme | None = None
         self._workspace: osqp.OSQP | None = None
 

@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from slipcar.planner.convex.solvers.interface import Solver
-
-
-def _structured() -> Solver:
-    from slipcar.planner.convex.solvers.structured import StructuredSolver
-
-    return StructuredSolver()
+from slipcar.planner.convex.solvers.structured import StructuredSolver
 
 
 def _osqp() -> Solver:
@@ -27,7 +22,7 @@ def _cvxpy() -> Solver:
 
 #: Constructors by name.
 BACKENDS: dict[str, Callable[[], Solver]] = {
-    "structured": _structured,
+    "structured": StructuredSolver,
     "osqp": _osqp,
     "cvxpy": _cvxpy,
 }

@@ -11,14 +11,12 @@ active set is then polished here.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solution, failed
 from slipcar.planner.convex.solvers.interior_point import interior_point
 from slipcar.planner.convex.solvers.lq_problem import End, LqProblem
-from slipcar.planner.convex.subproblem import Held, Pieces, Subproblem
+from slipcar.planner.convex.subproblem import Pieces, Subproblem
 from slipcar.planner.lq.banded import PrimalDual
 
 Array = np.ndarray
@@ -31,59 +29,53 @@ _SOLVES, _NODES, _POLISHING_SOLVES = 16, 16, 8
 _TERMINAL_WIDTH = 1e-10
 
 
-class _Search(NamedTuple):
-    """How a search for the active set ended: its point, or None, the active set, LQ solves."""
-
-    point: PrimalDual | None
-    active: Pieces
-    solves: int
-
-
 class StructuredSolver:
     """Solver for sub-problems of one shape; remembers which controls were held as a warm start."""
 
     def __init__(self) -> None:
         self._lq: LqProblem | None = None
-        self._held: Held | None = None
+        self._last: Pieces | None = None
 
     def solve(self, sub: Subproblem) -> Solution:
         """Solve one sub-problem; see the module's docstring."""
         shape = (*sub.f.shape, len(sub.g))
         if self._lq is None or self._lq.shape != shape:
-            self._lq, self._held = LqProblem(*shape), None
+            self._lq, self._last = LqProblem(*shape), None
         self._lq.load(sub)
-        if self._held is None or not sub.limited:
-            self._held = Held.nothing(*sub.r.shape)
         # Hinges on at the iterate, limits of the last solution, the terminal condition held.
-        start = Pieces(sub.b > 0.0, np.ones(len(sub.g), dtype=np.int64), self._held)
-        search = _newton(self._lq, start, _SOLVES + len(sub.f) // _NODES)
-        if search.point is None or np.abs(search.point.terminal).max(initial=0.0) > sub.rho:
-            search = _from_inside(self._lq, start, search.solves)
-        self._held, point = search.active.held, search.point
+        hinge, terminal = sub.b > 0.0, np.ones(len(sub.g), dtype=np.int64)
+        start = sub.free(hinge, terminal)
+        if self._last is not None and sub.limited:
+            start = self._last._replace(hinge=hinge, terminal=terminal)
+        point, pieces, solves = _newton(self._lq, start, _SOLVES + len(sub.f) // _NODES)
+        if point is None or np.abs(point.terminal).max(initial=0.0) > sub.rho:
+            point, pieces, spent = _from_inside(self._lq, start)
+            solves += spent
+        self._last = pieces
         if point is None:
-            return failed(sub, search.solves, f"not solved after {search.solves} LQ solves")
+            return failed(sub, solves, f"not solved after {solves} LQ solves")
         e = sub.admissible(point.e)
         objective = sub.objective(point.d, e)
-        return Solution(True, point.d, e, point.adjoint, point.terminal, objective, search.solves)
+        return Solution(True, point.d, e, point.adjoint, point.terminal, objective, solves)
 
 
-def _newton(lq: LqProblem, start: Pieces, limit: int) -> _Search:
-    """The point that lies on the pieces it was computed with."""
-    sub, active, terminal = lq.sub, start, None
+def _newton(lq: LqProblem, start: Pieces, limit: int) -> tuple[PrimalDual | None, Pieces, int]:
+    """The point that lies on the pieces it was computed with, or None; LQ solves."""
+    sub, pieces, terminal = lq.sub, start, None
     for solves in range(1, limit + 1):
-        weight, controls = sub.h * active.hinge, None
-        if active.held.any:
-            controls = sub.free_controls(active.held, sub.R, sub.r)
-        if active.terminal is not terminal:  # which rarely changes
-            terminal, end = active.terminal, _end(sub, active.terminal)
+        weight, controls = sub.h * pieces.hinge, None
+        if pieces.hold:
+            controls = sub.held_controls(pieces, sub.R, sub.r)
+        if pieces.terminal is not terminal:  # which rarely changes
+            terminal, end = pieces.terminal, _end(sub, pieces.terminal)
         point = lq.solve(weight, weight * sub.b, end, controls)
         if point is None:
-            return _Search(None, start, solves)
-        reached = _active_set(sub, point, active)
-        if reached.same_as(active):
-            return _Search(point, reached, solves)
-        active = reached
-    return _Search(None, start, limit)
+            return None, start, solves
+        reached = _reached(sub, point, pieces)
+        if reached.same_as(pieces):
+            return point, reached, solves
+        pieces = reached
+    return None, start, limit
 
 
 def _end(sub: Subproblem, terminal: Array) -> End:
@@ -94,8 +86,9 @@ def _end(sub: Subproblem, terminal: Array) -> End:
     return End(held, np.where(held, softness, 1.0), side)
 
 
-def _active_set(sub: Subproblem, point: PrimalDual, before: Pieces | None) -> Pieces:
+def _reached(sub: Subproblem, point: PrimalDual, before: Pieces | None) -> Pieces:
     """Pieces that a point lies on; it was computed on those `before`, or by the interior point."""
+    hinge = sub.hinge_arguments(point.d) > 0.0
     if before is not None and sub.tolerance == 0.0:
         terminal = before.terminal
     else:
@@ -110,29 +103,26 @@ def _active_set(sub: Subproblem, point: PrimalDual, before: Pieces | None) -> Pi
             # are still unsettled costs many more solves.
             limit = np.abs(before.terminal) == 2
             terminal = np.where(limit, before.terminal, np.clip(terminal, -1, 1))
-    if before is not None and not before.held.any and sub.strictly_inside(point.e):
-        held = before.held
-    else:
-        held = sub.held(point.e, sub.slope(point.e, point.adjoint))
-    return Pieces(sub.hinge_arguments(point.d) > 0.0, terminal, held)
+    if before is not None and not before.hold and sub.strictly_inside(point.e):
+        return before._replace(hinge=hinge, terminal=terminal)
+    return sub.pieces(hinge, terminal, point.e, sub.slope(point.adjoint, point.e))
 
 
-def _from_inside(lq: LqProblem, start: Pieces, spent: int) -> _Search:
+def _from_inside(lq: LqProblem, start: Pieces) -> tuple[PrimalDual | None, Pieces, int]:
     """The interior point's solution, polished by Newton's method where that makes it better."""
     sub = lq.sub
-    interior, solves = interior_point(sub, lq)
+    interior, spent = interior_point(sub, lq)
     if interior is None:
-        return _Search(None, start, spent + solves)
-    near = _active_set(sub, interior, None)
-    polished = _newton(lq, near, _POLISHING_SOLVES)
+        return None, start, spent
+    near = _reached(sub, interior, None)
+    polished, pieces, solves = _newton(lq, near, _POLISHING_SOLVES)
     # The last interior systems are ill-conditioned: judge what the controls really do.
-    best, active = _replayed(sub, interior), near
-    if polished.point is not None:
-        candidate = _replayed(sub, polished.point)
-        value = sub.objective(best.d, best.e)
+    best = _replayed(sub, interior)
+    if polished is not None:
+        candidate, value = _replayed(sub, polished), sub.objective(best.d, best.e)
         if sub.objective(candidate.d, candidate.e) <= value + 1e-9 * (1.0 + abs(value)):
-            best, active = candidate, polished.active
-    return _Search(best, active, spent + solves + polished.solves)
+            return candidate, pieces, spent + solves
+    return best, near, spent + solves
 
 
 def _replayed(sub: Subproblem, point: PrimalDual) -> PrimalDual:
