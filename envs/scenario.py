@@ -367,6 +367,8 @@ class Scenario:
         copy = object.__new__(type(self))
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         vars(copy).update({**fields, **changes})
+        if not changes.keys() & {"horizon", "nodes"}:
+            vars(copy)["times"] = self.times
         return copy
 
     def initial_guess(self) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,8 @@ def plan_batch(
         initial_states: states to start one problem from, (P, n).
         guesses: where to begin for each: a `Plan`, (states, controls), or None for its own; a
             guess is trusted, as `plan(..., cold_start="never")` does.
-        workers: threads; 0 takes one for each processor. The plans do not depend on it.
+        workers: threads; 0 takes one for each processor, or one alone where plans are so short that
+            threads would wait for each other. The plans do not depend on it.
         history: keep the trajectories of every iteration, as `plan` does; large.
         **options: `variance_weight`, `method`, `solver`, `tolerance`, `max_iterations`,
             `trust_region`, `linearization`, `terminal_tolerance`, `integrator`, `compiled`,
@@ -78,7 +79,8 @@ def plan_batch(
             with naming(task.label):
                 return attempt(task, chosen, history=history)
 
-        outcomes = in_threads(solve, tasks, workers)
+        alone = workers == 0 and all(task.posed is not None and task.posed.brief for task in tasks)
+        outcomes = in_threads(solve, tasks, 1 if alone else workers)
     record = {**chosen.as_dict(), "free_first": free_first}
     share = (time.perf_counter() - began) / max(len(tasks), 1)
     return [

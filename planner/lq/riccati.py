@@ -65,7 +65,7 @@ def stage(
     bad: Any = 0.0
     for i in range(m):
         bad = bad + choose(T[i, i], 0.0, 1.0)
-        row = T[i] / T[i, i]
+        row = T[i] * (1.0 / T[i, i])  # one division a pivot
         T = T - T[:, i, None] * row
         T[i] = row
     return T[m:, m:], T[:m, m:], bad

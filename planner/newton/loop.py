@@ -87,24 +87,36 @@ class Task(NamedTuple):
 
 
 class StepTaken(NamedTuple):
-    """One step tried: the numbers of an `Iteration`."""
+    """One step tried: where its line search ended, and how it came about.
 
-    effort: float
-    penalty: float
-    running: float
+    Attributes:
+        trial: the end of its line search.
+        solves: LQ problems solved for it.
+        shift: added to the Hessian, a trust region's multiplier.
+        variance: ∫ tr Σ dt; NaN where it weighs nothing.
+        linearize_seconds: spent on the model and the search.
+        solve_seconds: spent on LQ problems.
+    """
+
+    trial: _Trial
+    solves: int
+    shift: float
     variance: float
-    merit: float
-    predicted: float
-    actual: float
-    step: float
-    trust_radius: float
-    trust_multiplier: float
-    defect: float
-    terminal_residual: float
-    accepted: bool
-    solver_iterations: int
     linearize_seconds: float
     solve_seconds: float
+
+    def numbers(self) -> dict[str, Any]:
+        """Those of an `Iteration`, by its names."""
+        trial, new = self.trial, self.trial.new
+        return {
+            "effort": new.effort, "penalty": new.penalty, "running": new.running,
+            "variance": self.variance, "merit": trial.merit, "predicted": trial.predicted,
+            "actual": trial.actual, "step": trial.step, "trust_radius": trial.radius,
+            "trust_multiplier": self.shift, "defect": new.defect,
+            "terminal_residual": new.residual, "accepted": trial.accepted,
+            "solver_iterations": self.solves, "linearize_seconds": self.linearize_seconds,
+            "solve_seconds": self.solve_seconds,
+        }  # fmt: skip
 
 
 class Ending(NamedTuple):
@@ -135,7 +147,7 @@ class Filler(Protocol):
         ...
 
 
-#: Told of every step: the numbers, and the side where its trajectory is; True stops.
+#: Told of every step, and the side where its trajectory is; True stops.
 Watcher = Callable[[StepTaken, int], bool | None]
 
 
@@ -459,11 +471,7 @@ class Iteration:
         if w > 0.0:  # of the belief, where it has followed
             noise = self.workspace.view("noise")[0] if trial.accepted else new.charged - new.penalty
             variance = noise / w
-        row = StepTaken(
-            new.effort, new.penalty, new.running, variance, trial.merit, trial.predicted,
-            trial.actual, trial.step, trial.radius, shift, new.defect, new.residual,
-            trial.accepted, step.solves, linearizing, solving,
-        )  # fmt: skip
+        row = StepTaken(trial, step.solves, shift, variance, linearizing, solving)
         return bool(self.watch(row, there))
 
 

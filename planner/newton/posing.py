@@ -18,7 +18,7 @@ from slipcar.planner.moments.losses import deviations
 from slipcar.planner.newton.equations import Form
 from slipcar.planner.newton.filling import ModelFiller, TracedFiller
 from slipcar.planner.newton.loop import Filler
-from slipcar.planner.newton.program import Probe, Program, compilable, program_of
+from slipcar.planner.newton.program import Probe, Program, brief, compilable, program_of
 from slipcar.planner.newton.quantities import Dimensions, Filled, Traced
 from slipcar.planner.problem import checks
 from slipcar.planner.problem.integrators import change
@@ -66,6 +66,11 @@ class Posed:
         vars(copy).update(vars(self), model=model, **changes)
         vars(copy).pop("filler", None)
         return copy
+
+    @property
+    def brief(self) -> bool:
+        """Whether its kernels take no longer than threads need to take turns."""
+        return self.native and not self.reason and brief(self.problem.dims, len(self.model.dt))
 
     def program(self, form: Form) -> Program:
         """The kernels of a form of the equations."""

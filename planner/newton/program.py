@@ -37,6 +37,8 @@ _KEPT = 128
 #: Beyond this sum of states, controls and terminal conditions NumPy is used: kernels have no loops
 #: over matrices, and grow with the cube.
 _LARGEST = 72
+#: Kernels of so large a K (n + m)³ take longer than a thread needs to take over, some 50 µs.
+_LONG = 150_000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,6 +65,11 @@ class Program:
 def compilable(dims: Dimensions) -> bool:
     """Whether kernels of such a problem are short enough to be compiled."""
     return dims.n + dims.m + dims.q <= _LARGEST
+
+
+def brief(dims: Dimensions, K: int) -> bool:
+    """Whether kernels over K intervals are over before another thread could use the time."""
+    return K * (dims.n + dims.m) ** 3 < _LONG
 
 
 _programs: OrderedDict[Any, Program] = OrderedDict()
@@ -165,7 +172,7 @@ class Probe:
         with self._lock:
             arrays["t"][:, 0], arrays["dt"][:, 0] = t, dt
             arrays["x"][:], arrays["u"][:], arrays["number"][0] = x, u, number
-            self._code.functions["probe"](self._count, self._table.ctypes.data)
+            self._code.short["probe"](self._count, self._table.ctypes.data)
             return arrays["values"].copy()
 
 
@@ -248,8 +255,8 @@ class Workspace:
         if program.code is None:
             recursion = program.recursions[name]
             return functools.partial(in_numpy, recursion, program.layout, self._sides[side], self.K)
-        function = program.code.functions[name]
-        return functools.partial(function, self.K, self._tables[side].ctypes.data)
+        functions = program.code.short if brief(program.dims, self.K) else program.code.long
+        return functools.partial(functions[name], self.K, self._tables[side].ctypes.data)
 
 
 def _other(name: str, fields: Layout) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from slipcar.planner.moments.losses import floored
 from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.equations import Form
-from slipcar.planner.newton.loop import Ending, StepTaken, Task, Watcher, iterate
+from slipcar.planner.newton.loop import Ending, StepTaken, Task, iterate
 from slipcar.planner.newton.posing import Posed
 from slipcar.planner.newton.program import Workspace, borrow, give_back
 from slipcar.planner.newton.tuning import MEAN, NOISE
@@ -151,7 +151,7 @@ class _Steps:
             return False
         x, u, nu = self._workspace.trajectory(self._points[-1])
         step = Iteration(
-            mean=x, controls=u, terminal_multiplier=nu, virtual_control=0.0, **row._asdict()
+            mean=x, controls=u, terminal_multiplier=nu, virtual_control=0.0, **row.numbers()
         )
         self._reported.append(step)
         return bool(self._callback(step))
@@ -167,7 +167,8 @@ class _Steps:
 
 
 def _columns(rows: list[StepTaken], points: list[tuple[Array, Array, Array]]) -> dict[str, Array]:
-    columns = dict(zip(StepTaken._fields, map(np.array, zip(*rows, strict=True)), strict=True))
+    numbers = [row.numbers() for row in rows]
+    columns = {name: np.array([each[name] for each in numbers]) for name in numbers[0]}
     x, u, nu = (np.stack(parts) for parts in zip(*points, strict=True))
     none = np.zeros(len(rows))
     return columns | {
@@ -250,7 +251,6 @@ def solve_noise(
     tolerance: float,
     max_iterations: int,
     warm: Steered | None = None,
-    watch: Watcher | None = None,
 ) -> Steered:
     """A plan of an expected cost from x (N, n), u (K, m).
 
@@ -262,7 +262,6 @@ def solve_noise(
         tolerance: of the steps.
         max_iterations: at most so many steps.
         warm: gains, rows' weights and multipliers to begin with.
-        watch: told of every step.
 
     Raises:
         ValueError: if a function of the problem is not finite along the guess.
@@ -279,7 +278,7 @@ def solve_noise(
         workspace.at(0, "nu")[0] = warm.terminal
     task = task_of(model, stakes, tolerance, max_iterations, warm is not None)
     tuning = NOISE._replace(renewal=stakes.renewal)
-    ending = iterate(workspace, task, tuning, posed.filler, watch)
+    ending = iterate(workspace, task, tuning, posed.filler)
     if ending.status is None:
         raise ValueError(f"{not_finite(linearize(model, x, u))} is not finite along the guess")
     steered = _steered(workspace, stakes, ending)

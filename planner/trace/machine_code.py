@@ -20,8 +20,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-#: void f(int64 K, int64 address of the table of addresses); the lock of Python is let go.
-PROTOTYPE = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
+#: void f(int64 K, int64 address of the table of addresses): those that let go of Python's lock, and
+#: those that are over before another thread could take it.
+LONG = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
+SHORT = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
 #: Beyond so many characters of assembly LLVM's optimiser takes longer than its work saves.
 _OPTIMISED = 1_000_000
 #: Most files that are kept.
@@ -65,9 +67,9 @@ def _surroundings() -> bytes:
 
 
 class Code:
-    """Functions of one object file, loaded into this process: `functions`, by name.
+    """Functions of one object file, loaded into this process, by name: `short` and `long` ones.
 
-    They are called with K and the address of a table of addresses.
+    They are the same, called with K and the address of a table of addresses.
     """
 
     def __init__(self, data: bytes, names: Sequence[str]) -> None:
@@ -79,8 +81,9 @@ class Code:
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
             self._engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(data))
             self._engine.finalize_object()
-            address = self._engine.get_function_address
-            self.functions = {name: PROTOTYPE(address(name)) for name in names}
+            addresses = {name: self._engine.get_function_address(name) for name in names}
+            self.short = {name: SHORT(address) for name, address in addresses.items()}
+            self.long = {name: LONG(address) for name, address in addresses.items()}
 
 
 def code(key: bytes, names: Sequence[str], assembly: Callable[[], str], estimate: str = "") -> Code:

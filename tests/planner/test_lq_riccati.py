@@ -204,7 +204,7 @@ def _by_machine_code(p, known=()):
     arrays["G"][0], arrays["g"][0], arrays["softness"][0] = p.G.ravel(), p.g, _softness(p)
     table = np.array([a.ctypes.data for a in arrays.values()], dtype=np.int64)
     for sweep in ("backward", "forward"):
-        code.functions[sweep](K, table.ctypes.data)
+        code.short[sweep](K, table.ctypes.data)
     d, adjoint = arrays["d"][1:], arrays["adjoint"][1:]
     good = arrays["bad"][0, 0] == 0.0 and np.isfinite(adjoint.sum())
     return PrimalDual(d, arrays["e"][:K], adjoint, arrays["nu"][0]) if good else None

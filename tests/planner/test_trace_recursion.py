@@ -36,7 +36,7 @@ def _code(recursions, layout, known=None, graph=None):
 
 def _run(code, name, layout, arrays, K):
     table = np.array([arrays[field].ctypes.data for field in layout], dtype=np.int64)
-    code.functions[name](K, table.ctypes.data)
+    code.short[name](K, table.ctypes.data)
 
 
 def _arrays(layout, K, seed=0):
