@@ -1,4 +1,5 @@
 import os
+import sys
 
 from hypothesis import HealthCheck, settings
 
@@ -13,3 +14,7 @@ settings.register_profile(
     derandomize=os.environ.get("CI", "").lower() in {"1", "true"},
 )
 settings.load_profile("untimed")
+
+# Some tests edit a module that they wrote within the same second, to as many characters: Python
+# takes the bytecode of the last one for it, where there is any.
+sys.dont_write_bytecode = True
