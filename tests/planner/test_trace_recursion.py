@@ -540,6 +540,16 @@ def test_a_folder_that_cannot_be_written_to_is_done_without(cache, monkeypatch, 
     assert left == []
 
 
+def test_of_many_files_the_newest_are_kept(cache, monkeypatch):
+    monkeypatch.setattr(machine_code, "_KEPT", 3)
+    names = [f"{i:02}.o" for i in range(6)]
+    for age, name in zip(range(6, 0, -1), names, strict=True):
+        machine_code._write(cache / name, b"object")
+        os.utime(cache / name, times=(1e9 - age, 1e9 - age))
+    machine_code._write(cache / "newest.o", b"object")
+    assert sorted(path.name for path in cache.iterdir()) == [*names[-2:], "newest.o"]
+
+
 def test_without_a_home_there_is_no_folder(cache, monkeypatch):
     def homeless():
         raise RuntimeError("Could not determine home directory.")
