@@ -4,8 +4,8 @@
     p = plan(problem)                    # any object that satisfies Problem
     action, _ = OpenLoop(p).predict(observation)
 
-Needs NumPy and SciPy alone; numba, where installed, compiles it with your dynamics; the `osqp`
-and `cvxpy` backends import their packages when used.
+Needs NumPy and SciPy alone; with llvmlite it runs as machine code made from your functions. The
+`osqp` and `cvxpy` backends import their packages when used.
 """
 
 from slipcar.planner.batch import plan_batch

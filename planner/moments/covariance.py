@@ -1,4 +1,4 @@
-"""Mean and covariance of the linearised process (paper §6.2, SPEC §3.2).
+"""Mean and covariance of the linearised process (paper §6.2).
 
     Σ_{k+1} = A_k Σ_k A_kᵀ + dt (σ_k σ_kᵀ + Σ_d σ′_kd Σ_k σ′_kdᵀ),   A_k = I + dt ∂b/∂x
 
@@ -146,7 +146,7 @@ def trust_region_weight(hessian: Array, dt: Array) -> Array:
 
     Both paths begin alike and see the same Brownian motion, so to first order the error's
     diffusion is σ′ (x − x_k): ∫ tr Σᵉ is the quadratic part of the variance penalty with weight
-    one (SPEC §3.4).
+    one.
 
     Args:
         hessian: of the variance penalty with weight one at nodes 0..K−1, (K, n, n).

@@ -13,8 +13,8 @@ from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
 
-#: Weights on deviations from the mean for a five-state car (SPEC §6), the default when the
-#: plan has five states; otherwise the identity.
+#: Weights on deviations from the mean for a five-state car, the default when the plan has
+#: five states; otherwise the identity.
 _TRACKING = (10.0, 10.0, 1.0, 1.0, 1.0)
 
 

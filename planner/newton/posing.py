@@ -151,8 +151,8 @@ def pose(model: Model, *, constraints: bool = False, compiled: bool | None = Non
 # ------------------------------------------------------------------------------------ tracing
 
 
-_kinds: dict[Any, list[Posed]] = {}
-
+#: Traces of kinds of problems that name their numbers, the latest first.
+_kinds: dict[Any, tuple[Posed, ...]] = {}
 
 #: Said of functions that depend on more than their arguments, or on their arguments' types.
 _OTHER_VALUES = "traced, they give other values than called (do they depend on anything else?)"
@@ -179,15 +179,15 @@ def _named_trace(
         tuple((name, value.shape) for name, value in named.items()), len(model.weight),
         model.state_dim, model.control_dim,
     )  # fmt: skip
-    known = _kinds.setdefault(kind, [])
+    known = _kinds.get(kind, ())
     own = [value.ravel() for value in named.values()]
     count = sum(len(value) for value in own)
-    for i, posed in enumerate(known):
+    for posed in known:
         numbers = np.concatenate([*own, posed.numbers[count:]])
         candidate = posed.of(model, numbers=numbers)
         if _agrees(candidate, constraints, native):
-            if i:
-                known.insert(0, known.pop(i))
+            if posed is not known[0]:
+                _remember(kind, posed)
             return candidate
     try:
         posed = _traced(model, constraints, named)
@@ -195,10 +195,14 @@ def _named_trace(
         return None
     if not _agrees(posed, constraints, native):
         return None
-    # Without its model, lest the problem live for ever.
-    known.insert(0, posed.of(None))
-    del known[_TRACES:]
+    _remember(kind, posed.of(None))  # without its model, lest the problem live for ever
     return posed
+
+
+def _remember(kind: Any, posed: Posed) -> None:
+    """Put a trace first of its kind's; others may be reading the old ones."""
+    others = (other for other in _kinds.get(kind, ()) if other is not posed)
+    _kinds[kind] = (posed, *others)[:_TRACES]
 
 
 def _parameters(problem: Any) -> dict[str, Array] | None:

@@ -1,4 +1,4 @@
-"""Free final time: the horizon that is worth its cost (paper §5, SPEC §1).
+"""Free final time: the horizon that is worth its cost (paper §5).
 
     minimise over T:  V(T) + c T,      V(T) = least cost when the time grid is dilated to T
 
