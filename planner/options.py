@@ -55,7 +55,7 @@ class Options:
     variance_weight: float = 1.0
     solver: str | Solver = "structured"
     method: str = "auto"
-    tolerance: float = 1e-3
+    tolerance: float = 1e-4
     max_iterations: int = 100
     trust_region: str | None = None
     linearization: str = "composite"

@@ -38,7 +38,7 @@ def plan(
     variance_weight: float | None = None,
     solver: str | Solver = "structured",
     method: str = "auto",
-    tolerance: float = 1e-3,
+    tolerance: float = 1e-4,
     max_iterations: int = 100,
     trust_region: str | None = None,
     linearization: str = "composite",

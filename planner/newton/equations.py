@@ -6,7 +6,7 @@ A *point* is a trajectory x, u with its multipliers λ, ν and what follows from
     backward   quadratic model of a node and its stage, one step of the Riccati recursion
     forward    the step d, e, its multipliers, bounds that it passes, what the model promises
     shift      the candidate x + α d, u + α e
-    gramian    how far controls of unit cost move the end
+    residuals  how far a point is from the maximum principle, from its dynamics and its end
     spread     covariance; rows' spread and the margins that feedback needs of the bounds
     stakes     what rows' variances are charged
     weights    P, what noise is charged, and the gains K
@@ -39,7 +39,8 @@ from slipcar.planner.moments.propagation import (
     weight_step,
 )
 from slipcar.planner.newton.quantities import Dimensions, Quantities
-from slipcar.planner.trace.elementwise import choose, larger, magnitude, positive_part
+from slipcar.planner.problem.feasibility import LEAST_MOVE, TINY, end_sizes, path_sizes
+from slipcar.planner.trace.elementwise import choose, larger, magnitude, positive_part, within
 from slipcar.planner.trace.recursion import Carried, Field, Layout, Recursion, Symmetric
 
 Array = np.ndarray
@@ -49,12 +50,12 @@ Rows = Any  # SymbolRows or NumberRows
 #: What the iteration tells its kernels, entries of the row `knob`:
 KNOBS = (
     "alpha",  # length of the step that `shift` takes
-    "damping",  # multiple of the identity that makes the model convex
-    "kappa",  # weight of ½ ‖G d + g‖², zero at a solution
+    "damping",  # multiple of the controls' weight R that makes the model convex
+    "kappa",  # weight of ½ ‖G d + g‖² relative to how far controls of unit cost move the end
     "hinges",  # 0 leaves the rows out
     "curved",  # 1 with the curvature of dynamics, rows and end
     "clipped",  # 1 clips the controls to their bounds before the states follow
-    "softness",  # of the terminal condition's system
+    "softness",  # of the terminal condition's system, relative
     "stiffness",  # of the bounds that are held
     "variance_weight",  # w
     "closed",  # 1 with feedback
@@ -71,12 +72,10 @@ class Evaluation(NamedTuple):
         running: Σ dt (H + ℓᵀu).
         charged: rows, noise and a soft end, spread and weights held.
         pull: Σ λᵀf + νᵀg.
-        gap: Σ ‖f‖₁.
-        miss: ‖g‖₁ of an exact end.
+        gap: Σ_i max |λ_i| Σ |f_i|, in units of the cost; λ of the last step.
+        miss: Σ_j |ν_j g_j| of an exact end.
         defect: largest |f|.
         residual: largest |g| of an exact end.
-        size: largest |x|.
-        inconsistency: largest entry of the defects carried along the linearised dynamics.
         penalty: Σ dt Σ w max(0, c)² at the mean.
     """
 
@@ -88,8 +87,6 @@ class Evaluation(NamedTuple):
     miss: float
     defect: float
     residual: float
-    size: float
-    inconsistency: float
     penalty: float
 
 
@@ -99,7 +96,7 @@ class Model(NamedTuple):
     Attributes:
         bad: pivots that are not positive.
         charged: as in :class:`Evaluation`, with the weights of now.
-        dearest: largest |ν|.
+        dearest: Σ ν_j² W_jj: what the multipliers of the end would cost as controls.
     """
 
     bad: float
@@ -115,10 +112,9 @@ class Promise(NamedTuple):
         step: ∫ ‖Δu‖² dt.
         length: ∫ ΔuᵀRΔu dt.
         radius: ∫ ‖Δx‖² dt.
-        price: largest |λ|.
         pull: Σ λᵀf + νᵀg at the iterate.
-        gap: Σ ‖f‖₁ there.
-        miss: ‖g‖₁ there.
+        gap: Σ_i max |λ_i| Σ |f_i| there.
+        miss: Σ_j |ν_j g_j| there.
         changed: bounds that are passed and were not held, or the other way round.
         total: Σ λ: finite if all are.
     """
@@ -127,12 +123,26 @@ class Promise(NamedTuple):
     step: float
     length: float
     radius: float
-    price: float
     pull: float
     gap: float
     miss: float
     changed: float
     total: float
+
+
+class Residuals(NamedTuple):
+    """What `residuals` says of a point; all dimensionless.
+
+    Attributes:
+        control: the square of how far u is from argmax_U H, relative to its own size, in the
+            norm of the control's weight.
+        gap: largest Σ |f_i| relative to how far x_i moves.
+        end: largest |g_j| of an exact end relative to how far the states in it move.
+    """
+
+    control: float
+    gap: float
+    end: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +194,8 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "evaluated": Field((len(Evaluation._fields),), True),
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
-        "gramian": Field((), True), "noise": Field((), True),
+        "verified": Field((len(Residuals._fields),), True), "price": Field((n,), True),
+        "reach": Field((q,), True), "noise": Field((), True),
     }  # fmt: skip
     if form.noisy:
         fields |= {
@@ -215,7 +226,9 @@ class Equations:
             Recursion("backward", self._backward, self._last, self._multiplier, descending=True),
             Recursion("forward", self._forward, self._forward_start, self._forward_end),
             Recursion("shift", self._shift, lambda rows: {}, self._shift_end),
-            Recursion("gramian", self._gramian, self._gramian_start, self._gramian_end, True),
+            Recursion(
+                "residuals", self._residuals, self._residuals_start, self._residuals_end, True
+            ),
             Recursion("spread", self._spread, self._spread_start, self._spread_end),
             Recursion("weights", self._weights, self._weights_start, self._weights_end, True),
         ]
@@ -226,34 +239,31 @@ class Equations:
     # ------------------------------------------------------------------------------ evaluate
 
     def _evaluate_start(self, rows: Rows) -> Carried:
-        return {"sums": np.zeros(9), "far": np.zeros(self.dims.n)}
+        return {"sums": np.zeros(7)}
 
     def _evaluate(self, rows: Rows, carried: Carried) -> Carried:
         p, dt, u = self.problem.at(rows), rows["dt"], rows["u"]
-        effort, running, charged, pull, gap, defect, size, worst, penalty = carried["sums"]
+        effort, running, charged, pull, gap, defect, penalty = carried["sums"]
         f = p.next - rows.ahead("x")
         for name, value in (("f", f), ("A", p.A), ("B", p.B), ("c", p.c), ("C", p.C)):
             rows.write(name, value)
         if p.state_cost:
             rows.write("H_xx", p.H_xx)
-        far = f + p.A.dot(carried["far"])
         row_cost, mean_cost = self._row_costs(rows, p.c)
         sums = [
             effort + dt * u.dot(rows["R"].dot(u)),
             running + dt * p.ell.dot(u) + rows["dn"] * p.H,
             charged + row_cost + noise_charge(rows["P"], p.sigma, dt),
             pull + rows.ahead("lam").dot(f),
-            gap + np.sum(magnitude(f)),
+            gap + rows["price"].dot(magnitude(f)),
             riccati.largest(f, defect),
-            riccati.largest(rows["x"], size),
-            riccati.largest(far, worst),
             penalty + mean_cost,
         ]
-        return {"sums": np.array(sums), "far": far}
+        return {"sums": np.array(sums)}
 
     def _evaluate_end(self, rows: Rows, carried: Carried) -> None:
         p = self.problem.at(rows)
-        effort, running, charged, pull, gap, defect, size, worst, penalty = carried["sums"]
+        effort, running, charged, pull, gap, defect, penalty = carried["sums"]
         for name, value in (("c", p.c), ("C", p.C), ("g", p.g), ("G", p.G)):
             rows.write(name, value)
         if p.state_cost:
@@ -265,12 +275,11 @@ class Equations:
             charged = charged + (rows["W"] * p.g).dot(p.g)
         else:
             pull = pull + rows["nu"].dot(p.g)
-            miss, residual = np.sum(magnitude(p.g)), riccati.largest(p.g, 0.0)
+            miss = magnitude(rows["nu"]).dot(magnitude(p.g))
+            residual = riccati.largest(p.g, 0.0)
         evaluation = Evaluation(
             effort=effort, running=running + rows["dn"] * p.H, charged=charged, pull=pull, gap=gap,
-            miss=miss, defect=defect, residual=residual,
-            size=riccati.largest(rows["x"], size), inconsistency=worst,
-            penalty=penalty + mean_cost,
+            miss=miss, defect=defect, residual=residual, penalty=penalty + mean_cost,
         )  # fmt: skip
         rows.write("evaluated", np.array(evaluation, dtype=object))
 
@@ -317,12 +326,10 @@ class Equations:
         return Q, q
 
     def _loaded(self, rows: Rows, Q: Array, q: Array, loss: Loss) -> tuple[Array, Array]:
-        """With the hinges that are on, where rows are certain, and the shift."""
-        if not self.form.noisy:
-            hinges = self._knob(rows, "hinges")
-            Q, q = self._with_rows(Q, q, loss.scaled(hinges), rows["C"])
-        shift = (2.0 * self._knob(rows, "damping")) * rows["dn"]
-        return Q + shift * np.eye(self.dims.n), q
+        """With the hinges that are on, where rows are certain."""
+        if self.form.noisy:
+            return Q, q
+        return self._with_rows(Q, q, loss.scaled(self._knob(rows, "hinges")), rows["C"])
 
     def _last(self, rows: Rows) -> Carried:
         p, nu = self.problem.at(rows), rows["nu"]
@@ -338,9 +345,11 @@ class Equations:
         rows.write("Q", Q)
         rows.write("q", q)
         Q, q = self._loaded(rows, Q, q, loss)
-        kappa = self._knob(rows, "kappa")
         if len(G):
-            Q, q = Q + kappa * G.T.dot(G), q + kappa * G.T.dot(g)
+            reach = rows["reach"]
+            kappa = choose(reach, self._knob(rows, "kappa") / reach, 0.0 * reach)
+            weighed = kappa[:, None] * G
+            Q, q = Q + G.T.dot(weighed), q + weighed.T.dot(g)
         return {
             "V": Symmetric(riccati.last_value(Q, q, G)), "bad": 0.0, "charged": charged,
         }  # fmt: skip
@@ -367,28 +376,32 @@ class Equations:
 
     def _with_bounds(self, rows: Rows, R: Array, r: Array) -> tuple[Array, Array]:
         """With the shift, and the bounds that are held as stiff springs."""
-        held, u, stiffness = rows["held"], rows["u"], self._knob(rows, "stiffness")
+        held, u, weight = rows["held"], rows["u"], (2.0 * rows["dt"]) * rows["R"]
+        stiffness = self._knob(rows, "stiffness") * np.diagonal(weight)
         reach = choose(held, rows["upper"] - u, choose(-held, rows["lower"] - u, 0.0 * u))
-        shift = (2.0 * self._knob(rows, "damping")) * rows["dt"]
-        return R + np.eye(self.dims.m) * (shift + stiffness * (held * held)), r - stiffness * reach
+        R = R + self._knob(rows, "damping") * weight
+        return R + np.eye(self.dims.m) * (stiffness * (held * held)), r - stiffness * reach
 
     def _multiplier(self, rows: Rows, carried: Carried) -> None:
         bad, dearest = carried["bad"], 0.0
         if not self.form.soft:
-            softness = self._knob(rows, "softness")
-            nu, singular = riccati.terminal_multiplier(carried["V"], rows["g"], softness)
-            bad, dearest = bad + singular, riccati.largest(nu, 0.0)
+            V, softness = carried["V"], self._knob(rows, "softness")
+            nu, singular = riccati.terminal_multiplier(V, rows["g"], softness)
+            reach = choose(self._knob(rows, "kappa"), rows["reach"], -np.diagonal(V)[-len(nu) :])
+            rows.write("reach", reach)
+            bad, dearest = bad + singular, (nu * nu).dot(reach)
             rows.write("nu_new", nu)
         rows.write("modelled", np.array(Model(bad, carried["charged"], dearest), dtype=object))
 
     # ------------------------------------------------------------------------------- forward
 
     def _forward_start(self, rows: Rows) -> Carried:
-        return {"d": np.zeros(self.dims.n), "sums": np.zeros(9)}
+        n = self.dims.n
+        return {"d": np.zeros(n), "price": np.zeros(n), "gap": np.zeros(n), "sums": np.zeros(7)}
 
     def _forward(self, rows: Rows, carried: Carried) -> Carried:
         d, u, f, dt = carried["d"], rows["u"], rows["f"], rows["dt"]
-        change, step, length, radius, price, pull, gap, changed, total = carried["sums"]
+        change, step, length, radius, pull, changed, total = carried["sums"]
         nu = rows["nu_new"][:0] if self.form.soft else rows["nu_new"]
         free = riccati.respond(rows["law"], d, nu)
         above, below = u + free - rows["upper"], rows["lower"] - u - free
@@ -407,24 +420,25 @@ class Equations:
             step + dt * inside.dot(inside),
             length + dt * inside.dot(rows["R"].dot(inside)),
             radius + rows["dn"] * d.dot(d),
-            riccati.largest(lam, price),
             pull + lam.dot(f),
-            gap + np.sum(magnitude(f)),
             changed + np.sum(magnitude(passed - rows["held"])),
             total + np.sum(lam),
         ]
-        return {"d": ahead, "sums": np.array(sums)}
+        price, gap = larger(magnitude(lam), carried["price"]), carried["gap"] + magnitude(f)
+        return {"d": ahead, "price": price, "gap": gap, "sums": np.array(sums)}
 
     def _forward_end(self, rows: Rows, carried: Carried) -> None:
-        d, g = carried["d"], rows["g"]
-        change, step, length, radius, price, pull, gap, changed, total = carried["sums"]
+        d, g, price = carried["d"], rows["g"], carried["price"]
+        change, step, length, radius, pull, changed, total = carried["sums"]
         rows.write("d", d)
+        rows.write("price", price)
         miss: Any = 0.0
         if not self.form.soft:
-            pull, miss = pull + rows["nu_new"].dot(g), np.sum(magnitude(g))
+            pull = pull + rows["nu_new"].dot(g)
+            miss = magnitude(rows["nu_new"]).dot(magnitude(g))
         promise = Promise(
             change + self._node_change(rows, d), step, length, radius + rows["dn"] * d.dot(d),
-            price, pull, gap, miss, changed, total,
+            pull, price.dot(carried["gap"]), miss, changed, total,
         )  # fmt: skip
         rows.write("promised", np.array(promise, dtype=object))
 
@@ -455,17 +469,61 @@ class Equations:
     def _shift_end(self, rows: Rows, carried: Carried) -> None:
         rows.write("x_new", rows["x"] + self._knob(rows, "alpha") * rows["d"])
 
-    def _gramian_start(self, rows: Rows) -> Carried:
-        return {"Phi": rows["G"], "total": 0.0}
+    # ------------------------------------------------------------------------------- residuals
 
-    def _gramian(self, rows: Rows, carried: Carried) -> Carried:
-        Phi = carried["Phi"]
-        pushed = Phi.dot(rows["B"])
-        moved = np.sum(pushed * pushed.dot(rows["R_inverse"])) / (2.0 * rows["dt"])
-        return {"Phi": Phi.dot(rows["A"]), "total": carried["total"] + moved}
+    def _gradient(self, rows: Rows) -> Array:
+        """Of what is charged at a node, with its rows, (n,)."""
+        _, q, loss = self._node_model(rows)
+        return q if self.form.noisy else self._with_rows(np.zeros(()), q, loss, rows["C"])[1]
 
-    def _gramian_end(self, rows: Rows, carried: Carried) -> None:
-        rows.write("gramian", carried["total"])
+    def _residuals_start(self, rows: Rows) -> Carried:
+        n, g, G = self.dims.n, rows["g"], rows["G"]
+        pull = 2.0 * rows["W"] * g if self.form.soft else rows["nu"]
+        return {
+            "adjoint": self._gradient(rows) + G.T.dot(pull), "off": 0.0, "size": 0.0,
+            "gap": np.zeros(n), "least": rows["x"], "most": rows["x"],
+            "reach": np.zeros((n, self.dims.m)),
+        }  # fmt: skip
+
+    def _residuals(self, rows: Rows, carried: Carried) -> Carried:
+        """The adjoint μ along the paths that the last step's feedback K leads to.
+
+            μ_k = ∇ℓ_k + A_kᵀ μ_{k+1} + K_kᵀ γ_k,    γ_k = ∂H_k/∂u
+
+        It is the one without K where γ = 0, and bounded for unstable systems; controls at their
+        bounds take no part in K.
+        """
+        p, dt, x, u, adjoint = (
+            self.problem.at(rows), rows["dt"], rows["x"], rows["u"], carried["adjoint"],
+        )  # fmt: skip
+        A, B, weight = rows["A"], rows["B"], np.diagonal(rows["R"])
+        slope = (2.0 * dt) * rows["R"].dot(u) + dt * p.ell + B.T.dot(adjoint)
+        off = within(u - slope / ((2.0 * dt) * weight), rows["lower"], rows["upper"]) - u
+        own = u + p.ell / (2.0 * weight)  # from where the control's own cost is least
+        noise, _ = noise_model(rows["P"], p.sigma, p.d_sigma, dt)
+        q = self._gradient(rows) + dt * p.d_ell.T.dot(u) + noise
+        inside = choose(rows["upper"] - u, choose(u - rows["lower"], 1.0 + 0.0 * u, 0.0), 0.0)
+        answered = rows["law"][:, : self.dims.n].T.dot(inside * slope)
+        return {
+            "adjoint": q + A.T.dot(adjoint) - answered,
+            "off": larger(weight.dot(off * off), carried["off"]),
+            "size": larger(weight.dot(own * own), carried["size"]),
+            "gap": carried["gap"] + magnitude(rows["f"]),
+            "least": -larger(-x, -carried["least"]), "most": larger(x, carried["most"]),
+            "reach": carried["reach"] + magnitude(B),
+        }  # fmt: skip
+
+    def _residuals_end(self, rows: Rows, carried: Carried) -> None:
+        sizes = path_sizes(carried["least"], carried["most"])
+        gap, end = riccati.largest(carried["gap"] / sizes, 0.0), 0.0
+        if not self.form.soft:
+            end = riccati.largest(rows["g"] / end_sizes(rows["G"], sizes), end)
+        pushed = carried["reach"] / sizes[:, None]
+        rates = np.array([riccati.largest(column, 0.0) for column in pushed.T])
+        floors = choose(rates, LEAST_MOVE / rates, 0.0)
+        least = np.diagonal(rows["R"]).dot(floors * floors) + TINY
+        control = carried["off"] / larger(carried["size"], least)
+        rows.write("verified", np.array(Residuals(control, gap, end), dtype=object))
 
     # --------------------------------------------------------------------------------- belief
 

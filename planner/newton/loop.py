@@ -48,22 +48,19 @@ from slipcar.planner.status import Status
 
 Array = np.ndarray
 
-_ALPHA, _DAMPING, _KAPPA, _HINGES, _CURVED, _CLIPPED, _SOFTNESS, _RENEWAL = (
+_ALPHA, _DAMPING, _KAPPA, _HINGES, _CURVED, _CLIPPED, _RENEWAL = (
     KNOBS.index(name)
-    for name in (
-        "alpha", "damping", "kappa", "hinges", "curved", "clipped", "softness", "renewal",
-    )
-)  # fmt: skip
+    for name in ("alpha", "damping", "kappa", "hinges", "curved", "clipped", "renewal")
+)
 
 
 class Task(NamedTuple):
     """What an iteration is asked for; the arrays of its workspace hold the rest.
 
     Attributes:
-        tolerance: stop when two steps together, ∫ ‖Δu‖² dt, fall to it.
+        tolerance: stop when the square of the relative residual of the maximum principle falls to
+            it.
         max_iterations: at most so many steps.
-        unit: of a shift, the largest diagonal entry of R.
-        longest_dt: the longest interval.
         bounded: whether there are bounds of the controls.
         state_cost: whether there is a state cost, whose Hessian may need a projection.
         released: leave the rows out at first.
@@ -75,8 +72,6 @@ class Task(NamedTuple):
 
     tolerance: float
     max_iterations: int
-    unit: float
-    longest_dt: float
     bounded: bool
     state_cost: bool
     released: bool = False
@@ -190,12 +185,11 @@ class Iteration:
         ws.arrays["knob"][0] = [{
             "hinges": 1.0, "variance_weight": task.variance_weight,
             "closed": 1.0 if task.feedback else 0.0, "saturation": task.saturation,
-            "stiffness": tuning.bound_stiffness * 2.0 * task.longest_dt * task.unit,
+            "stiffness": tuning.bound_stiffness, "softness": SOFTNESS,
         }.get(name, 0.0) for name in KNOBS]  # fmt: skip
         self.at = self._evaluated(0)
         if not math.isfinite(sum(self.at)):
             return Ending(None, 0, 0, self.at)
-        self._measure_end()
         self._believe(fresh=not task.warm)
         self._first_effort = self.at.effort
         status = self._iterate()
@@ -205,7 +199,7 @@ class Iteration:
 
     def _iterate(self) -> Status:
         task, tuning = self.task, self.tuning
-        last = settling = math.inf
+        settling = math.inf
         released = task.released
         clock = time.perf_counter()
         for iteration in range(task.max_iterations):
@@ -213,7 +207,7 @@ class Iteration:
             if released and (
                 settling < tuning.released * effort or iteration >= tuning.released_steps
             ):
-                released, last = False, math.inf
+                released = False
             newton = not released and (
                 iteration >= tuning.free_steps
                 or (self.tried > 0 and settling < tuning.settled * effort)
@@ -232,17 +226,12 @@ class Iteration:
             self.tried += 1
             shift, there, status = self.shift if curved else 0.0, 1 - self.side, None
             if trial.accepted:
-                settling = trial.step * task.unit
+                settling = trial.length
                 self._accepted(step, trial, newton)
-                # A short step that a shift made short proves nothing: the force it stands for,
-                # p¹ (x − x_k), must vanish too.
-                length = trial.step + shift * shift * trial.radius
-                short = trial.alpha == 1.0 and length + last <= task.tolerance
-                if short and not released and self._consistent():
+                if not released and self._extremal():
                     status = Status.CONVERGED
                 elif self.hopeless >= tuning.patience:
                     status = Status.STALLED
-                last = length
             else:
                 status = self._refused(newton, fallback)
             now = time.perf_counter()
@@ -263,15 +252,6 @@ class Iteration:
         self._evaluate[side]()
         evaluation: Evaluation = self.workspace.evaluation()
         return evaluation
-
-    def _measure_end(self) -> None:
-        """How far controls of unit cost move the end: scales of the terminal condition."""
-        ws, self.gramian, self.kappa = self.workspace, 0.0, 0.0
-        if self.exact:
-            ws.kernels["gramian"][0]()
-            self.gramian = ws.view("gramian")[0]
-        if self.gramian > 0.0:
-            self.kappa = self.tuning.terminal_curvature * ws.program.dims.q / self.gramian
 
     def _believe(self, fresh: bool = False) -> None:
         """Let the belief follow the iterate: what noise is charged, and gains."""
@@ -330,10 +310,9 @@ class Iteration:
 
     def _step(self, curved: bool, released: bool) -> _Step | None:
         """The model's step: bounds settle, and the shift grows until the model is convex."""
-        knobs, tuning, gramian = self._knobs, self.tuning, self.gramian
-        kappa = self.kappa if curved else 0.0
+        knobs, tuning = self._knobs, self.tuning
         knobs[_HINGES], knobs[_CURVED] = 0.0 if released else 1.0, 1.0 if curved else 0.0
-        knobs[_KAPPA], knobs[_SOFTNESS] = kappa, SOFTNESS * gramian / (1.0 + kappa * gramian)
+        knobs[_KAPPA] = tuning.terminal_curvature if curved else 0.0
         solves = 0
         for _ in range(tuning.inertia_trials):
             knobs[_DAMPING] = self.shift if curved else 0.0
@@ -343,7 +322,7 @@ class Iteration:
                 return _Step(model, promise, solves)
             if not curved:
                 return None
-            self.shift = max(tuning.shift_up * self.shift, tuning.first_shift * self.task.unit)
+            self.shift = max(tuning.shift_up * self.shift, tuning.first_shift)
         return None
 
     def _settle_bounds(self) -> tuple[Model, Promise | None, int]:
@@ -372,8 +351,7 @@ class Iteration:
     def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
         model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
-        price, dear = 0.5 * promise.price, 0.5 * model.dearest
-        lacking = price * promise.gap + dear * promise.miss
+        lacking = 0.5 * (promise.gap + promise.miss)
         gained = promise.pull - promise.change
         factor = max(1.0, -gained / (0.75 * lacking)) if lacking > 0.0 else 1.0
         before = at.effort + at.running + model.charged + promise.pull + factor * lacking
@@ -388,7 +366,7 @@ class Iteration:
             self._shift[self.side]()
             new = self._evaluated(there)
             merit = new.effort + new.running + new.charged + new.pull
-            merit += factor * (price * new.gap + dear * new.miss)
+            merit += factor * 0.5 * (new.gap + new.miss)
             actual = before - merit
             accepted = math.isfinite(merit) and (
                 not newton
@@ -401,36 +379,36 @@ class Iteration:
         square = alpha * alpha
         return _Trial(
             new, alpha, accepted, merit, predicted, actual, noise, square * promise.step,
-            square * promise.radius,
+            square * promise.length, square * promise.radius,
         )  # fmt: skip
 
     # -------------------------------------------------------------------------- what follows
 
     def _refused(self, newton: bool, fallback: bool) -> Status | None:
         """Shorten the next step; a status where there is no point in trying it."""
-        tuning, unit = self.tuning, self.task.unit
+        tuning = self.tuning
         if not newton:
             return Status.SOLVER_FAILED
         if fallback:
             return Status.STALLED
         self.rejected += 1
-        self.shift = max(tuning.shift_up * self.shift, 0.1 * tuning.first_shift * unit)
+        self.shift = max(tuning.shift_up * self.shift, 0.1 * tuning.first_shift)
         return (
             Status.STALLED if not tuning.falls_back and self.rejected >= tuning.rejections else None
         )
 
     def _accepted(self, step: _Step, trial: _Trial, newton: bool) -> None:
         """Make the candidate the iterate; adapt shift and renewal."""
-        tuning, unit = self.tuning, self.task.unit
+        tuning = self.tuning
         self.rejected = 0
         cost = abs(trial.new.effort + trial.new.running + trial.new.penalty)
-        dear = step.model.dearest > tuning.dearest * (1.0 + cost)
+        dear = step.model.dearest > tuning.dearest * tuning.dearest * cost
         self.hopeless = self.hopeless + 1 if newton and dear else 0
         if newton:
-            least = tuning.first_shift * unit
+            least = tuning.first_shift
             self.stale += 1
-            if trial.step < 0.5 * self.shortest:
-                self.shortest, self.stale = trial.step, 0
+            if trial.length < 0.5 * self.shortest:
+                self.shortest, self.stale = trial.length, 0
                 self.floor /= tuning.shift_up
                 if self.floor < 0.01 * least:
                     self.floor = 0.0
@@ -444,7 +422,7 @@ class Iteration:
     def _next_shift(self, trial: _Trial) -> float:
         """Less after a step that did what the model said, more after one that did not."""
         tuning, shift = self.tuning, self.shift
-        least = 0.01 * tuning.first_shift * self.task.unit
+        least = 0.01 * tuning.first_shift
         fulfilled = trial.actual > 0.7 * trial.predicted or trial.predicted <= trial.noise
         if trial.alpha == 1.0 and fulfilled:
             return shift / tuning.shift_down if shift > least else 0.0
@@ -452,12 +430,15 @@ class Iteration:
             return max(2.0 * shift, least)
         return shift
 
-    def _consistent(self) -> bool:
-        """Whether the end is where it must be and the mean the controls' path, to first order."""
-        at, tuning = self.at, self.tuning
-        size = 1.0 + at.size
-        feasible = at.residual <= tuning.feasibility * size
-        return feasible and at.inconsistency <= tuning.consistency * size
+    def _extremal(self) -> bool:
+        """Whether the iterate meets the maximum principle, its dynamics and its end."""
+        at = self.at
+        if at.gap + at.miss > self.tuning.defective * (abs(at.effort) + abs(at.running)):
+            return False  # not worth a closer look
+        self.workspace.kernels["residuals"][self.side]()
+        off, tuning = self.workspace.residuals(), self.tuning
+        feasible = off.gap <= tuning.consistency and off.end <= tuning.feasibility
+        return bool(feasible and off.control <= self.task.tolerance)
 
     def _tell(
         self, step: _Step, trial: _Trial, shift: float, there: int, linearizing: float,
@@ -494,6 +475,7 @@ class _Trial(NamedTuple):
     actual: float
     noise: float
     step: float
+    length: float
     radius: float
 
 

@@ -25,6 +25,7 @@ from slipcar.planner.newton.equations import (
     Form,
     Model,
     Promise,
+    Residuals,
     layout,
 )
 from slipcar.planner.newton.quantities import Dimensions, Filled, Traced
@@ -189,6 +190,7 @@ class Workspace:
         evaluation: reads what `evaluate` said.
         model: reads what `backward` said.
         promise: reads what `forward` said.
+        residuals: reads what `residuals` said.
     """
 
     def __init__(self, program: Program, K: int) -> None:
@@ -214,6 +216,7 @@ class Workspace:
         self.evaluation = self._reader("evaluated", Evaluation)
         self.model = self._reader("modelled", Model)
         self.promise = self._reader("promised", Promise)
+        self.residuals = self._reader("verified", Residuals)
 
     def _together(self, suffix: str) -> Array:
         """Put a point's x, u and ν side by side, so that one copy keeps them all."""

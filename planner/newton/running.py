@@ -26,7 +26,7 @@ from slipcar.planner.status import Status
 Array = np.ndarray
 
 #: Arrays that every run begins with at zero.
-_CLEARED = ("d", "e", "held", "P", "Sigma", "H_psd", "lam", "lam_new", "nu", "nu_new")
+_CLEARED = ("d", "e", "held", "P", "Sigma", "H_psd", "lam", "lam_new", "nu", "nu_new", "price", "reach", "law")
 _CLEARED_NOISY = ("gains", "eta", "offset", "s")
 _COUNTS = ("solver_iterations",)
 
@@ -89,8 +89,8 @@ def solve_mean(
     workspace = borrow(posed.program(Form()), len(model.dt))
     load(workspace, posed, model.weight, x, u)
     task = Task(
-        tolerance=options.tolerance, max_iterations=options.max_iterations, unit=model.unit,
-        longest_dt=model.longest_dt, bounded=model.bounded, state_cost=model.has("state_cost"),
+        tolerance=options.tolerance, max_iterations=options.max_iterations,
+        bounded=model.bounded, state_cost=model.has("state_cost"),
         released=free_first and len(model.weight) > 0,
         variance_weight=w,
     )  # fmt: skip
@@ -235,8 +235,8 @@ def task_of(
 ) -> Task:
     """What an iteration on an expected cost is asked for."""
     return Task(
-        tolerance=tolerance, max_iterations=max_iterations, unit=model.unit,
-        longest_dt=model.longest_dt, bounded=model.bounded, state_cost=model.has("state_cost"),
+        tolerance=tolerance, max_iterations=max_iterations,
+        bounded=model.bounded, state_cost=model.has("state_cost"),
         variance_weight=stakes.variance_weight,
         feedback=stakes.feedback, saturation=stakes.saturation, warm=warm,
     )  # fmt: skip

@@ -18,8 +18,7 @@ class Tuning(NamedTuple):
         bound_stiffness: active bounds are held by a weight so much stiffer than the control's.
         terminal_curvature: a multiple of ‖G d + g‖², zero at a solution, lets the recursion see
             that the terminal condition holds: relative to the inverse of its Gramian.
-        first_shift: the first multiple of the identity added to a Hessian that is not convex, in
-            units of the largest diagonal entry of R.
+        first_shift: the first multiple of R added to a Hessian that is not convex.
         shift_up: how it grows until the problem is convex, or when a step is rejected.
         shift_down: how it falls after a good step.
         inertia_trials: so many LQ problems at most to find it.
@@ -36,8 +35,10 @@ class Tuning(NamedTuple):
         dearest: multipliers of the end so large beside the cost, `patience` times in a row, say
             that it cannot be reached.
         noise: relative accuracy of the merit function.
-        feasibility: what a converged plan may leave of the terminal condition, per unit of state.
-        consistency: and between its mean and the path its controls lead to.
+        defective: defects that cost more than this part of the effort are no extremal's.
+        feasibility: what a converged plan may leave of the terminal condition, relative to how far
+            the states in it move.
+        consistency: and of its dynamics, all nodes together, relative to how far each state moves.
     """
 
     free_steps: int = 20
@@ -62,8 +63,9 @@ class Tuning(NamedTuple):
     least_renewal: float = 0.05
     dearest: float = 1e12
     noise: float = 1e-9
+    defective: float = 0.1
     feasibility: float = 1e-6
-    consistency: float = 1e-4
+    consistency: float = 1e-5
 
 
 #: Of plans of the mean; and of plans that count the noise, which start from one of them.

@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
+from slipcar.planner.trace.elementwise import larger, magnitude
 
 Array = np.ndarray
 
 #: A converged plan leaves no more than this of the terminal condition, per unit of the state.
 FEASIBILITY = 1e-6
+
+#: Lengths are compared with how far a state moves along the path, and with this part of the
+#: largest state: so much may be rounding.
+_ROUNDING = 1e-8
+#: Controls are compared with their own size; at least with what moves a state by this part of how
+#: far it moves.
+LEAST_MOVE = 1e-3
+#: Against division by zero.
+TINY = 1e-150
+
+
+def path_sizes(least: Array, most: Array) -> Any:
+    """How far each state moves along a path, (n,), from its least and largest values (n,).
+
+    Arrays of numbers and of expressions alike.
+    """
+    largest = TINY
+    for low, high in zip(least, most, strict=True):
+        largest = larger(larger(magnitude(low), magnitude(high)), largest)
+    return most - least + _ROUNDING * largest
+
+
+def end_sizes(G: Array, sizes: Any) -> Any:
+    """How far each terminal condition moves when the states do, (q,): its unit."""
+    return magnitude(G).dot(sizes) + TINY
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")

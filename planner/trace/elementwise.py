@@ -33,6 +33,11 @@ def positive_part(a: Any) -> Any:
     return choose(-a, 0.0 * a, a)
 
 
+def within(a: Any, lower: Any, upper: Any) -> Any:
+    """The nearest to a in [lower, upper]; what is not a number stays so."""
+    return choose(a - upper, upper, choose(lower - a, lower, a))
+
+
 def magnitude(a: Any) -> Any:
     """|a|."""
     return abs(a)
