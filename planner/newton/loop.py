@@ -176,7 +176,7 @@ class Iteration:
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
-        self.hopeless = 0
+        self.hopeless, self.curvature = 0, 1.0
         self._bent = False
 
     def run(self) -> Ending:
@@ -311,18 +311,26 @@ class Iteration:
     def _step(self, curved: bool, released: bool) -> _Step | None:
         """The model's step: bounds settle, and the shift grows until the model is convex."""
         knobs, tuning = self._knobs, self.tuning
-        knobs[_HINGES], knobs[_CURVED] = 0.0 if released else 1.0, 1.0 if curved else 0.0
+        knobs[_HINGES] = 0.0 if released else 1.0
         knobs[_KAPPA] = tuning.terminal_curvature if curved else 0.0
         solves = 0
         for _ in range(tuning.inertia_trials):
             knobs[_DAMPING] = self.shift if curved else 0.0
+            knobs[_CURVED] = self.curvature if curved else 0.0
             model, promise, rounds = self._settle_bounds()
             solves += rounds
             if promise is not None:
+                if solves == rounds:
+                    self.curvature = min(1.0, 2.0 * self.curvature)
                 return _Step(model, promise, solves)
-            if not curved:
+            if not curved or self.curvature == 0.0:
                 return None
-            self.shift = max(tuning.shift_up * self.shift, tuning.first_shift)
+            if self.shift < tuning.largest_shift:
+                self.shift = max(tuning.shift_up * self.shift, tuning.first_shift)
+            else:
+                self.curvature *= 0.5
+                if self.curvature < tuning.least_curvature:
+                    self.curvature = 0.0
         return None
 
     def _settle_bounds(self) -> tuple[Model, Promise | None, int]:
