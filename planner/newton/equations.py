@@ -226,6 +226,7 @@ class Equations:
             Recursion("backward", self._backward, self._last, self._multiplier, descending=True),
             Recursion("forward", self._forward, self._forward_start, self._forward_end),
             Recursion("shift", self._shift, lambda rows: {}, self._shift_end),
+            Recursion("rollout", self._rollout, self._rollout_start),
             Recursion(
                 "residuals", self._residuals, self._residuals_start, self._residuals_end, True
             ),
@@ -468,6 +469,32 @@ class Equations:
 
     def _shift_end(self, rows: Rows, carried: Carried) -> None:
         rows.write("x_new", rows["x"] + self._knob(rows, "alpha") * rows["d"])
+
+    def _rollout_start(self, rows: Rows) -> Carried:
+        rows.write("x", rows["x_new"])
+        rows.write("u", self._answer(rows, rows["x_new"]))
+        return {}
+
+    def _rollout(self, rows: Rows, carried: Carried) -> Carried:
+        """The path that the step's law leads to, run on the candidate's side.
+
+        u = ū + α e + K (x − x̄ − α d) within bounds, and x follows the dynamics but for 1 − α of
+        the defects that there were (Mastalli et al. 2020, feasibility-driven DDP).
+        """
+        lacking = 1.0 - self._knob(rows, "alpha")
+        x = self.problem.at(rows).next - lacking * rows["f_new"]
+        rows.write_ahead("x", x)
+        rows.write_ahead("u", self._answer(rows, x, ahead=True))
+        return {}
+
+    def _answer(self, rows: Rows, x: Array, *, ahead: bool = False) -> Array:
+        """The law's control at x, at this node or the next one."""
+        at = rows.ahead if ahead else rows.__getitem__
+        n, u, law, off = self.dims.n, at("u_new"), at("law"), x - at("x_new")
+        nu = rows["nu"][:0] if self.form.soft else rows["nu"]
+        steady = law[:, n] + (law[:, n + 1 :].dot(nu) if len(nu) else 0.0)
+        u = u - law[:, :n].dot(off) - self._knob(rows, "alpha") * steady
+        return within(u, at("lower"), at("upper"))
 
     # ------------------------------------------------------------------------------- residuals
 

@@ -172,6 +172,7 @@ class Iteration:
         self.charged = self.noisy or task.variance_weight > 0.0
         self._evaluate, self._shift = workspace.kernels["evaluate"], workspace.kernels["shift"]
         self._backward, self._forward = workspace.kernels["backward"], workspace.kernels["forward"]
+        self._rollout = workspace.kernels["rollout"]
         self._knobs = workspace.knobs
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
@@ -369,9 +370,13 @@ class Iteration:
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
         there = 1 - self.side
+        rolled = False
         for trial in range(trials):
             self._knobs[_ALPHA] = alpha
-            self._shift[self.side]()
+            if rolled:
+                self._rollout[there]()
+            else:
+                self._shift[self.side]()
             new = self._evaluated(there)
             merit = new.effort + new.running + new.charged + new.pull
             merit += factor * 0.5 * (new.gap + new.miss)
@@ -383,7 +388,9 @@ class Iteration:
             )
             if accepted or trial == trials - 1:
                 break
-            alpha *= 0.5
+            if rolled:
+                alpha *= 0.5
+            rolled = True
         square = alpha * alpha
         return _Trial(
             new, alpha, accepted, merit, predicted, actual, noise, square * promise.step,

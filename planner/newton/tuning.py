@@ -53,7 +53,7 @@ class Tuning(NamedTuple):
     shift_down: float = 4.0
     inertia_trials: int = 31
     armijo: float = 1e-3
-    searches: int = 5
+    searches: int = 8
     long_searches: int = 14
     rejections: int = 3
     falls_back: bool = True
