@@ -109,6 +109,7 @@ class Promise(NamedTuple):
 
     Attributes:
         change: of the cost, by the model.
+        slope: of the cost along the step.
         step: ∫ ‖Δu‖² dt.
         length: ∫ ΔuᵀRΔu dt.
         radius: ∫ ‖Δx‖² dt.
@@ -120,6 +121,7 @@ class Promise(NamedTuple):
     """
 
     change: float
+    slope: float
     step: float
     length: float
     radius: float
@@ -398,11 +400,11 @@ class Equations:
 
     def _forward_start(self, rows: Rows) -> Carried:
         n = self.dims.n
-        return {"d": np.zeros(n), "price": np.zeros(n), "gap": np.zeros(n), "sums": np.zeros(7)}
+        return {"d": np.zeros(n), "price": np.zeros(n), "gap": np.zeros(n), "sums": np.zeros(8)}
 
     def _forward(self, rows: Rows, carried: Carried) -> Carried:
         d, u, f, dt = carried["d"], rows["u"], rows["f"], rows["dt"]
-        change, step, length, radius, pull, changed, total = carried["sums"]
+        change, slope, step, length, radius, pull, changed, total = carried["sums"]
         nu = rows["nu_new"][:0] if self.form.soft else rows["nu_new"]
         free = riccati.respond(rows["law"], d, nu)
         above, below = u + free - rows["upper"], rows["lower"] - u - free
@@ -418,6 +420,7 @@ class Equations:
         control = rows["rk"] + 0.5 * rows["Rk"].dot(inside) + rows["S"].dot(d)
         sums = [
             change + self._node_change(rows, d) + control.dot(inside),
+            slope + self._node_slope(rows, d) + rows["rk"].dot(inside),
             step + dt * inside.dot(inside),
             length + dt * inside.dot(rows["R"].dot(inside)),
             radius + rows["dn"] * d.dot(d),
@@ -430,7 +433,7 @@ class Equations:
 
     def _forward_end(self, rows: Rows, carried: Carried) -> None:
         d, g, price = carried["d"], rows["g"], carried["price"]
-        change, step, length, radius, pull, changed, total = carried["sums"]
+        change, slope, step, length, radius, pull, changed, total = carried["sums"]
         rows.write("d", d)
         rows.write("price", price)
         miss: Any = 0.0
@@ -438,7 +441,7 @@ class Equations:
             pull = pull + rows["nu_new"].dot(g)
             miss = magnitude(rows["nu_new"]).dot(magnitude(g))
         promise = Promise(
-            change + self._node_change(rows, d), step, length, radius + rows["dn"] * d.dot(d),
+            change + self._node_change(rows, d), slope + self._node_slope(rows, d), step, length, radius + rows["dn"] * d.dot(d),
             pull, price.dot(carried["gap"]), miss, changed, total,
         )  # fmt: skip
         rows.write("promised", np.array(promise, dtype=object))
@@ -457,6 +460,14 @@ class Equations:
             c, weight = rows["c"], rows["weight"] * rows["dn"]
             after, before = positive_part(c + rows["C"].dot(d)), positive_part(c)
             value = value + weight.dot(after * after - before * before)
+        return value
+
+    def _node_slope(self, rows: Rows, d: Array) -> Any:
+        """How a node's costs change with the first part of a step d."""
+        value = rows["q"].dot(d)
+        if not self.form.noisy and self.dims.p:
+            weight = 2.0 * self._knob(rows, "hinges") * rows["weight"] * rows["dn"]
+            value = value + (weight * positive_part(rows["c"])).dot(rows["C"].dot(d))
         return value
 
     # ------------------------------------------------------------------ candidate, the end's reach

@@ -320,16 +320,19 @@ class Iteration:
             knobs[_CURVED] = self.curvature if curved else 0.0
             model, promise, rounds = self._settle_bounds()
             solves += rounds
-            if promise is not None:
+            if promise is not None and not (
+                self.curvature > 0.0 and curved
+                and promise.pull - promise.slope < -tuning.bent * (promise.gap + promise.miss)
+            ):
                 if solves == rounds:
-                    self.curvature = min(1.0, 2.0 * self.curvature)
+                    self.curvature = min(1.0, max(2.0 * self.curvature, tuning.least_curvature))
                 return _Step(model, promise, solves)
             if not curved or self.curvature == 0.0:
                 return None
             if self.shift < tuning.largest_shift:
                 self.shift = max(tuning.shift_up * self.shift, tuning.first_shift)
             else:
-                self.curvature *= 0.5
+                self.curvature *= 0.25
                 if self.curvature < tuning.least_curvature:
                     self.curvature = 0.0
         return None
@@ -361,10 +364,11 @@ class Iteration:
         """Shorten the step until the merit function falls; free steps are taken whole."""
         model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
         lacking = 0.5 * (promise.gap + promise.miss)
-        gained = promise.pull - promise.change
-        factor = max(1.0, -gained / (0.75 * lacking)) if lacking > 0.0 else 1.0
+        descent = promise.pull - promise.slope
+        factor = max(1.0, -descent / (0.75 * lacking)) if lacking > 0.0 else 1.0
+        descent += factor * lacking
         before = at.effort + at.running + model.charged + promise.pull + factor * lacking
-        predicted = gained + factor * lacking
+        predicted = promise.pull - promise.change + factor * lacking
         noise = tuning.noise * (1.0 + abs(before))
         most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
@@ -383,8 +387,8 @@ class Iteration:
             actual = before - merit
             accepted = math.isfinite(merit) and (
                 not newton
-                or (predicted <= noise and actual >= -noise)
-                or actual >= tuning.armijo * alpha * predicted
+                or (descent <= noise and actual >= -noise)
+                or actual >= tuning.armijo * alpha * descent
             )
             if accepted or trial == trials - 1:
                 break

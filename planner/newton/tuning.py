@@ -63,8 +63,9 @@ class Tuning(NamedTuple):
     least_renewal: float = 0.05
     dearest: float = 1e12
     noise: float = 1e-9
-    largest_shift: float = 0.5
-    least_curvature: float = 0.01
+    largest_shift: float = 5
+    least_curvature: float = 0.05
+    bent: float = 0.5
     defective: float = 0.1
     feasibility: float = 1e-6
     consistency: float = 1e-5
