@@ -6,7 +6,7 @@ A variant is another guess for a system, other units or another horizon; the ele
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from .flight import Quad12, Rocket
@@ -68,20 +68,32 @@ SYSTEMS: dict[str, System] = {
         optimum=1.06774,
     ),
     "CSTR": System(CSTR, Dimensions("m 1", "N", "1", "m 1"), optimum=-719.957941),
-    "Arm": System(Arm, _ARM, optimum=0.52548),
-    "FreeFlyer": System(FreeFlyer, _FLYER, optimum=0.1),
+    "Arm": System(Arm, _ARM, optimum=0.52787767),
+    "FreeFlyer": System(FreeFlyer, _FLYER, optimum=0.95030083),
     "Rendezvous": System(
         Rendezvous,
         Dimensions("m m m m/s m/s m/s", "m/s2 m/s2 m/s2", "", "m m m m/s m/s m/s"),
-        optimum=0.006,
+        optimum=0.0061169113,
     ),
-    "Glucose": System(Glucose, Dimensions("m 1/s N", "N/s", "m", "m N"), optimum=1177.0),
-    "FallingArm": System(FallingArm, _ARM, optimum=0.449, variant=True),
+    "Glucose": System(Glucose, Dimensions("m 1/s N", "N/s", "m", "m N"), optimum=1302.0965),
+    "FallingArm": System(FallingArm, _ARM, optimum=0.45028068, variant=True),
     "FreeFlyerMm": System(
-        lambda: in_units(FreeFlyer(), _FLYER, MILLIMETRES), _FLYER, optimum=0.1, variant=True
+        lambda: in_units(FreeFlyer(), _FLYER, MILLIMETRES), _FLYER, optimum=0.95030083, variant=True
     ),
     "Upright": System(Upright, Dimensions("1 1/s", "N", "", "1 1/s"), 5.703873, variant=True),
 }  # fmt: skip
 
 #: Those that are planned in other units.
 IN_UNITS = ("CartPole", "Rocket", "Race", "FreeFlyer", "CSTR")
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """The systems whose names begin with one of these; upper and lower case are the same.
+
+    Raises:
+        ValueError: for a name that no system's begins with.
+    """
+    for name in names:
+        if not any(system.lower().startswith(name.lower()) for system in SYSTEMS):
+            raise ValueError(f"no system is called {name}: there are {', '.join(SYSTEMS)}")
+    return [s for s in SYSTEMS if any(s.lower().startswith(name.lower()) for name in names)]

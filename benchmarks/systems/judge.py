@@ -13,6 +13,8 @@ Array = np.ndarray
 
 #: Relative misses that count as none: of an Euler step, the terminal condition and the bounds.
 FEASIBLE = 1e-4
+#: What is dearer by this part of the cost passes for as good.
+AS_GOOD = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,10 +34,14 @@ class Judged:
     outside: float
 
     @property
+    def miss(self) -> float:
+        """The largest of the three."""
+        return max(self.defect, self.terminal, self.outside)
+
+    @property
     def feasible(self) -> bool:
         """Whether it is a trajectory of the problem at all."""
-        misses = np.array([self.defect, self.terminal, self.outside])
-        return bool(np.isfinite(self.cost) and (misses <= FEASIBLE).all())
+        return bool(np.isfinite(self.cost) and self.miss <= FEASIBLE)
 
 
 def judge(problem: Any, x: Array, u: Array) -> Judged:
@@ -65,6 +71,11 @@ def _judge(problem: Any, x: Array, u: Array) -> Judged:
         terminal=_part(problem.terminal(x[-1]), on_the_way),
         outside=_part(u - np.clip(u, model.lower, model.upper), np.abs(u).max(axis=0)),
     )
+
+
+def excess(cost: float, reference: float) -> float:
+    """How much dearer, in parts of the reference."""
+    return (cost - reference) / abs(reference)
 
 
 def _part(miss: Array, size: Array) -> float:

@@ -58,7 +58,7 @@ class FallingArm:
     goal = np.array([0.9, -0.8, 0.0, 0.0])
     times = np.linspace(0.0, 2.0, 61)
     control_weight = np.diag([0.01, 0.02])
-    control_bounds = np.array([35.0, 15.0])
+    control_bounds = np.array([20.0, 8.0])
     terminal_weight = np.array([100.0, 100.0, 10.0, 10.0])
 
     def drift(self, t: Any, x: Array, u: Array) -> Array:

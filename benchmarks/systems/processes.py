@@ -56,8 +56,8 @@ class Glucose:
     basal = np.array([81.0, 0.0, 15.0])
     start = np.array([220.0, 0.0, 15.0])
     times = np.linspace(0.0, 240.0, 81)
-    control_weight = np.array([[1e-3]])
-    control_bounds = np.array([[0.0], [200.0]])
+    control_weight = np.array([[1e-2]])
+    control_bounds = np.array([[0.0], [50.0]])
     terminal_weight = np.array([1.0, 1.0])
     penalty_weight = np.array([10.0])
 
