@@ -24,7 +24,7 @@ from slipcar.planner.trace.elementwise import choose, larger, magnitude
 
 Array = np.ndarray
 
-#: The system of the terminal condition is regularised by this much, relative to its Gramian.
+#: The system of the terminal condition is regularised by this much, relative to its diagonal.
 SOFTNESS = 1e-13
 
 
@@ -77,7 +77,7 @@ def terminal_multiplier(V: Array, g: Array, softness: Any) -> tuple[Array, Any]:
     Args:
         V: of node 0, where d = 0.
         g: (t,).
-        softness: added to the diagonal of W.
+        softness: this part of W's diagonal is added to it.
     """
     t = len(g)
     n = len(V) - 1 - t
@@ -89,7 +89,7 @@ def terminal_multiplier(V: Array, g: Array, softness: Any) -> tuple[Array, Any]:
         for j in range(i + 1):
             value = W[i, j] - L[i, :j].dot(L[j, :j]) if j else W[i, j]
             if i == j:
-                value = value + softness
+                value = value + softness * W[i, i]
                 bad = bad + choose(value, 0.0, 1.0)
                 L[i, i] = np.sqrt(value)
             else:

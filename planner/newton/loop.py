@@ -369,7 +369,7 @@ class Iteration:
         descent += factor * lacking
         before = at.effort + at.running + model.charged + promise.pull + factor * lacking
         predicted = promise.pull - promise.change + factor * lacking
-        noise = tuning.noise * (1.0 + abs(before))
+        noise = tuning.noise * (at.effort + abs(at.running) + model.charged + abs(promise.pull))
         most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1

@@ -63,7 +63,7 @@ class Tuning(NamedTuple):
     least_renewal: float = 0.05
     dearest: float = 1e12
     noise: float = 1e-9
-    largest_shift: float = 5
+    largest_shift: float = 0.5
     least_curvature: float = 0.05
     bent: float = 0.5
     defective: float = 0.1
