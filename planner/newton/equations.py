@@ -519,7 +519,7 @@ class Equations:
         pull = 2.0 * rows["W"] * g if self.form.soft else rows["nu"]
         return {
             "adjoint": self._gradient(rows) + G.T.dot(pull), "off": 0.0, "size": 0.0,
-            "gap": np.zeros(n), "least": rows["x"], "most": rows["x"],
+            "gap": np.zeros(n), "least": rows["x"], "most": rows["x"], "terms": np.zeros(n),
             "reach": np.zeros((n, self.dims.m)),
         }  # fmt: skip
 
@@ -541,6 +541,7 @@ class Equations:
         noise, _ = noise_model(rows["P"], p.sigma, p.d_sigma, dt)
         q = self._gradient(rows) + dt * p.d_ell.T.dot(u) + noise
         inside = choose(rows["upper"] - u, choose(u - rows["lower"], 1.0 + 0.0 * u, 0.0), 0.0)
+        terms = magnitude(A).dot(magnitude(x)) + magnitude(B).dot(magnitude(u))
         answered = rows["law"][:, : self.dims.n].T.dot(inside * slope)
         return {
             "adjoint": q + A.T.dot(adjoint) - answered,
@@ -548,11 +549,11 @@ class Equations:
             "size": larger(weight.dot(own * own), carried["size"]),
             "gap": carried["gap"] + magnitude(rows["f"]),
             "least": -larger(-x, -carried["least"]), "most": larger(x, carried["most"]),
-            "reach": carried["reach"] + magnitude(B),
+            "terms": larger(terms, carried["terms"]), "reach": carried["reach"] + magnitude(B),
         }  # fmt: skip
 
     def _residuals_end(self, rows: Rows, carried: Carried) -> None:
-        sizes = path_sizes(carried["least"], carried["most"])
+        sizes = path_sizes(carried["most"] - carried["least"], carried["terms"], rows["A"])
         gap, end = riccati.largest(carried["gap"] / sizes, 0.0), 0.0
         if not self.form.soft:
             end = riccati.largest(rows["g"] / end_sizes(rows["G"], sizes), end)

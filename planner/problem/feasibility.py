@@ -8,15 +8,14 @@ import numpy as np
 
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
-from slipcar.planner.trace.elementwise import larger, magnitude
+from slipcar.planner.trace.elementwise import magnitude
 
 Array = np.ndarray
 
 #: A converged plan leaves no more than this of the terminal condition, per unit of the state.
 FEASIBILITY = 1e-6
 
-#: Lengths are compared with how far a state moves along the path, and with this part of the
-#: largest state: so much may be rounding.
+#: Of what a state is put together from, this part may be rounding.
 _ROUNDING = 1e-8
 #: Controls are compared with their own size; at least with what moves a state by this part of how
 #: far it moves.
@@ -25,15 +24,19 @@ LEAST_MOVE = 1e-3
 TINY = 1e-150
 
 
-def path_sizes(least: Array, most: Array) -> Any:
-    """How far each state moves along a path, (n,), from its least and largest values (n,).
+def path_sizes(moved: Array, terms: Array, A: Array) -> Any:
+    """How far each state moves along a path, (n,): its unit, whatever the units of the problem.
+
+    Args:
+        moved: largest less smallest value of each state, (n,).
+        terms: largest |A| |x| + |B| |u| of each state, what it is put together from, (n,).
+        A: of some interval, (n, n), which carries the rounding of one state to others.
 
     Arrays of numbers and of expressions alike.
     """
-    largest = TINY
-    for low, high in zip(least, most, strict=True):
-        largest = larger(larger(magnitude(low), magnitude(high)), largest)
-    return most - least + _ROUNDING * largest
+    for _ in range(3):
+        terms = magnitude(A).dot(terms)
+    return moved + _ROUNDING * terms + TINY
 
 
 def end_sizes(G: Array, sizes: Any) -> Any:
