@@ -30,8 +30,16 @@ One process, pinned to one core where the system allows it (`OMP_NUM_THREADS=1`)
 is stepped by turns, in an order drawn anew each round, so that a busy machine is busy for all; a
 first turn is not counted. Steps per second belong to the machine; what carries over are ratios
 within a run."""
+_HOW_SYSTEMS = """\
+One process, one core (`OMP_NUM_THREADS=1`). A time of slipcar's is the whole call of `plan` on a
+problem that it has met before, a time of CasADi's the call of its solver on a programme that is
+built. What either believes of its answer is judged by the problem's own functions. Milliseconds
+belong to the machine; what carries over are ratios within a run."""
 #: By page; `_HOW` elsewhere.
-_HOW_OF = {"benchmarks-environment.md": _HOW_ENVIRONMENT}
+_HOW_OF = {
+    "benchmarks-environment.md": _HOW_ENVIRONMENT,
+    "benchmarks-systems.md": _HOW_SYSTEMS,
+}
 
 
 def write(

@@ -23,12 +23,13 @@ import risk_paper
 import risk_times
 import risk_worlds
 import simulation
+import systems.section
 import turns
 import worlds
 
 PARTS = ("planners", "growth", "cold", "simulation", "environment", "risk_times")
 #: Minutes; on request.
-LONG_PARTS = ("worlds", "risk_paper", "risk")
+LONG_PARTS = ("worlds", "systems", "risk_paper", "risk")
 #: Pages of the docs: file, heading and parts.
 PAGES = (
     ("benchmarks.md", "Benchmarks", ("planners", "growth", "cold", "simulation", "worlds")),
@@ -37,6 +38,7 @@ PAGES = (
         "Benchmarks: risk, feedback, receding horizon",
         ("risk_paper", "risk_times", "risk"),
     ),
+    ("benchmarks-systems.md", "Benchmarks: users' systems", ("systems",)),
     ("benchmarks-environment.md", "Benchmarks: environment", ("environment",)),
 )
 
@@ -52,6 +54,7 @@ def main() -> None:
         "environment": environment.section,
         "risk_times": functools.partial(risk_times.section, arguments.rounds),
         "worlds": functools.partial(worlds.section, arguments.seeds, folder),
+        "systems": functools.partial(systems.section.section, folder),
         "risk_paper": risk_paper.section,
         "risk": functools.partial(risk_worlds.section, arguments.risk_worlds, folder),
     }

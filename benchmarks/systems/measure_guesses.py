@@ -48,7 +48,7 @@ class FromGuesses:
         return self.best + AS_GOOD * abs(self.best)
 
     def row(self) -> dict[str, Any]:
-        """A row of the table: what failed by its seeds, CONVERGED_ELSEWHERE if it is infeasible."""
+        """A row of the table: what failed by its seeds, CONVERGED_INFEASIBLE if it lies."""
         ours, theirs = self.ours, self.theirs
         failed = [seed for seed, cost in enumerate(self.costs) if not np.isfinite(cost)]
         return {
@@ -106,7 +106,7 @@ def _from(name: str, problem: Any, guess: Guess, *, own: bool) -> Attempt:
 
 
 def _reason(failed: Attempt) -> str:
-    return "CONVERGED_ELSEWHERE" if failed.ok else failed.status
+    return "CONVERGED_INFEASIBLE" if failed.ok else failed.status
 
 
 def _worth(problem: Any, answer: Solved) -> float:
