@@ -197,7 +197,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
         "verified": Field((len(Residuals._fields),), True), "price": Field((n,), True),
-        "reach": Field((q,), True), "noise": Field((), True),
+        "reach": Field((q,), True), "late": Field(()), "noise": Field((), True),
     }  # fmt: skip
     if form.noisy:
         fields |= {
@@ -355,6 +355,7 @@ class Equations:
             Q, q = Q + G.T.dot(weighed), q + weighed.T.dot(g)
         return {
             "V": Symmetric(riccati.last_value(Q, q, G)), "bad": 0.0, "charged": charged,
+            "reach": np.zeros(len(G)),
         }  # fmt: skip
 
     def _backward(self, rows: Rows, carried: Carried) -> Carried:
@@ -375,7 +376,14 @@ class Equations:
         V, law, bad = riccati.stage(V, A, B, rows["f"], Q, q, R, r, S)
         rows.write("law", law)
         charged = carried["charged"] + np.sum(loss.value) + noise_charge(rows["P"], p.sigma, dt)
-        return {"V": Symmetric(V), "bad": carried["bad"] + bad, "charged": charged}
+        reach = choose(rows["late"], self._reached(V), carried["reach"])
+        return {
+            "V": Symmetric(V), "bad": carried["bad"] + bad, "charged": charged, "reach": reach,
+        }  # fmt: skip
+
+    def _reached(self, V: Array) -> Array:
+        """W_jj of the cost to go: how far controls of unit cost move each terminal condition."""
+        return -np.diagonal(V)[self.dims.n + 1 :]
 
     def _with_bounds(self, rows: Rows, R: Array, r: Array) -> tuple[Array, Array]:
         """With the shift, and the bounds that are held as stiff springs."""
@@ -390,9 +398,9 @@ class Equations:
         if not self.form.soft:
             V, softness = carried["V"], self._knob(rows, "softness")
             nu, singular = riccati.terminal_multiplier(V, rows["g"], softness)
-            reach = choose(self._knob(rows, "kappa"), rows["reach"], -np.diagonal(V)[-len(nu) :])
+            reach = choose(self._knob(rows, "kappa"), rows["reach"], carried["reach"])
             rows.write("reach", reach)
-            bad, dearest = bad + singular, (nu * nu).dot(reach)
+            bad, dearest = bad + singular, (nu * nu).dot(self._reached(V))
             rows.write("nu_new", nu)
         rows.write("modelled", np.array(Model(bad, carried["charged"], dearest), dtype=object))
 

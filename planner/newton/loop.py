@@ -192,6 +192,8 @@ class Iteration:
         if not math.isfinite(sum(self.at)):
             return Ending(None, 0, 0, self.at)
         self._believe(fresh=not task.warm)
+        self._backward[0]()  # with kappa zero: how far the last controls move the end
+        self._knobs[_KAPPA] = tuning.terminal_curvature
         self._first_effort = self.at.effort
         status = self._iterate()
         if self.charged:
@@ -313,7 +315,6 @@ class Iteration:
         """The model's step: bounds settle, and the shift grows until the model is convex."""
         knobs, tuning = self._knobs, self.tuning
         knobs[_HINGES] = 0.0 if released else 1.0
-        knobs[_KAPPA] = tuning.terminal_curvature if curved else 0.0
         solves = 0
         for _ in range(tuning.inertia_trials):
             knobs[_DAMPING] = self.shift if curved else 0.0

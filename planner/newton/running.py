@@ -49,6 +49,9 @@ def load(workspace: Workspace, posed: Posed, weight: Array, x: Array, u: Array) 
     arrays["t"][:, 0] = model.times
     arrays["dt"][:K, 0] = model.dt
     arrays["dn"][1:, 0] = model.dt
+    dims = workspace.program.dims
+    arrays["late"][:] = 0.0
+    arrays["late"][max(K - 2 * -(-dims.q // dims.m) - 2, 0) :] = 1.0
     arrays["lower"][:], arrays["upper"][:] = model.lower, model.upper
     for name in _CLEARED:
         arrays[name].fill(0.0)
