@@ -52,6 +52,10 @@ class Violations:
     control: float  # largest |argmax_U H_k − u_k|, p from the adjoint recursion
     hamiltonian: float  # largest max_U H_k − H_k(u_k) ≥ 0
     bounds: float  # largest distance of a u_k from U
+    gap: float  # largest Σ_k |F_k(x_k, u_k) − x_{k+1}| of a state, relative to how far it moves
+    end: float  # largest |g_j| beyond its tolerance, relative to how far it moves
+    maximality: float  # largest distance of u_k from argmax_U H_k, relative to the controls' size
+    outside: float  # and from U
     adjoint: Array  # λ_1..λ_K = −p_1..−p_K by the recursion, (K, n)
     scales: Scales
 
@@ -59,10 +63,10 @@ class Violations:
     def relative(self) -> dict[str, float]:
         """Residuals by name, divided by their scales."""
         return {
-            "dynamics": self.dynamics / self.scales.state,
-            "terminal condition": self.terminal / self.scales.state,
-            "u = argmax H": self.control / self.scales.control,
-            "u in U": self.bounds / self.scales.control,
+            "dynamics": self.gap,
+            "terminal condition": self.end,
+            "u = argmax H": self.maximality,
+            "u in U": self.outside,
         }
 
     @property
@@ -87,17 +91,23 @@ def violations(
     of the terminal box.
     """
     at = first_order(model, x, u, variance_weight)
-    adjoint = adjoint_of(at, terminal)
+    adjoint = adjoint_of(model, at, terminal)
     e, gain = best_step(model, at, adjoint)
+    beyond = np.maximum(np.abs(at.lin.g) - terminal_tolerance, 0.0)
+    out, units = model.admissible(u) - u, scales(model, at, adjoint)
     return Violations(
         at=at,
         dynamics=_largest(at.lin.defect),
-        terminal=_largest(np.maximum(np.abs(at.lin.g) - terminal_tolerance, 0.0)),
+        terminal=_largest(beyond),
         control=_largest(e),
         hamiltonian=max(0.0, float(np.max(gain))),
-        bounds=_largest(model.admissible(u) - u),
+        bounds=_largest(out),
+        gap=_largest(np.abs(at.lin.defect).sum(axis=0) / units.state),
+        end=_largest(beyond / units.end),
+        maximality=float(np.linalg.norm(e / units.control, axis=1).max()),
+        outside=float(np.linalg.norm(out / units.control, axis=1).max()),
         adjoint=adjoint,
-        scales=scales(at, adjoint),
+        scales=units,
     )
 
 
@@ -114,7 +124,8 @@ class Certificate:
         relaxed: sub-problems whose terminal condition had to be relaxed, (iterations,) bool.
         violations: residuals of the non-linear problem.
         adjoint: p at every node by the adjoint recursion, p⁰ = −1, (N, n).
-        adjoint_difference: largest difference from the sub-problem's own adjoint.
+        adjoint_difference: largest difference from the plan's own adjoint.
+        adjoint_off: the same, relative to the largest of each component.
         transversality: max_U H at the end, which vanishes when the final time is free; None when
             it is fixed.
         cost_rate: mean cost per time, the scale of `transversality`.
@@ -131,6 +142,7 @@ class Certificate:
     violations: Violations
     adjoint: Array
     adjoint_difference: float
+    adjoint_off: float
     transversality: float | None
     cost_rate: float
     tolerance: float
@@ -149,7 +161,7 @@ class Certificate:
     def residuals(self) -> dict[str, float]:
         """Every residual relative to its scale."""
         relative = self.violations.relative
-        relative["adjoint equation"] = self.adjoint_difference / self.violations.scales.adjoint
+        relative["adjoint equation"] = self.adjoint_off
         if self.transversality is not None:
             relative["transversality"] = abs(self.transversality) / self.cost_rate
         return relative
@@ -194,8 +206,8 @@ class Certificate:
             f"  dynamics    mean misses its own step by {v.dynamics:.1e}",
             f"  terminal    |g(x(T))| = {v.terminal:.1e} beyond its tolerance",
             f"  adjoint     p from 𝔭 and p of the sub-problem differ by "
-            f"{self.adjoint_difference:.1e} of {v.scales.adjoint:.2g}",
-            f"  maximality  u misses argmax H by {v.control:.1e} of {v.scales.control:.2g}; "
+            f"{self.adjoint_difference:.1e} of {v.scales.adjoint.max():.2g}",
+            f"  maximality  u misses argmax H by {v.control:.1e} of {v.scales.control.max():.2g}; "
             f"H by {v.hamiltonian:.1e}; U by {v.bounds:.1e}",
         ]
         if self.transversality is not None:
@@ -228,6 +240,7 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
     )  # fmt: skip
     lin = broken.at.lin
     adjoint = -np.vstack([lin.A[0].T @ broken.adjoint[0], broken.adjoint])
+    off = adjoint[1:] - own.adjoint[1:]
     history = [
         Multipliers(-h.terminal_multiplier, -1.0, -h.trust_multiplier, own.adjoint).normalized()
         for h in plan.history
@@ -242,9 +255,10 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
         terminal_history=np.reshape([h.terminal for h in history], (len(history), q)),
         cost_history=np.array([h.cost for h in history]),
         trust_region_history=np.array([h.trust_region for h in history]),
-        relaxed=lacking > _RELAXED * broken.scales.state,
+        relaxed=lacking > _RELAXED * broken.scales.end.max(),
         violations=broken, adjoint=adjoint,
-        adjoint_difference=_largest(adjoint[1:] - own.adjoint[1:]),
+        adjoint_difference=_largest(off),
+        adjoint_off=_largest(off / broken.scales.adjoint),
         transversality=transversality, cost_rate=max(rate, abs(time_weight or 0.0), 1e-300),
         tolerance=float(tolerance),
     )  # fmt: skip

@@ -72,9 +72,8 @@ class Conditions:
         rest[-1] += terminal @ lin.G
         control = sub.admissible(sub.wanted(np.zeros_like(u), slope))
         end = lin.g - np.clip(self._pressed(lin.g, terminal), -self.tolerance, self.tolerance)
-        states = np.concatenate([lin.defect.ravel(), end]) / scales.state
-        adjoints, controls = rest.ravel() / scales.adjoint, control.ravel() / scales.control
-        parts = np.concatenate([states, adjoints, controls])
+        scaled = (lin.defect / scales.state, end / scales.end, rest / scales.adjoint)
+        parts = np.concatenate([part.ravel() for part in (*scaled, control / scales.control)])
         norm = float(np.linalg.norm(parts))
         largest = float(np.max(np.abs(parts))) if np.isfinite(norm) else np.inf
         return ShootingPoint(gradients, adjoint, terminal, rest, slope, norm, largest)
@@ -108,7 +107,8 @@ class Conditions:
 
     def _pressed(self, g: Array, terminal: Array) -> Array:
         """Where ν/s leads from g; its projection onto the terminal box is g at one, (q,)."""
-        return g + terminal * (self.scales.state / self.scales.adjoint)
+        cost = float(np.max(self.scales.adjoint * self.scales.state))
+        return g + terminal * self.scales.end**2 / cost
 
     def _pieces(
         self,
@@ -157,7 +157,7 @@ class Conditions:
         """
         model, x = self.model, here.gradients.lin.x
         d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], x[:-1]))
-        enough = _COUPLING_PART * min(here.largest, 1.0) ** 2 * self.scales.adjoint
+        enough = _COUPLING_PART * min(here.largest, 1.0) ** 2 * self.scales.adjoint.min()
         push = np.zeros_like(here.adjoint)
         pushes: list[Array] = []
         errors: list[Array] = []

@@ -25,6 +25,8 @@ import numpy as np
 
 from slipcar.planner.convex.subproblem import Subproblem, convexify, variance_of
 from slipcar.planner.moments import covariance as moments
+from slipcar.planner.moments.propagation import gain, weight_step
+from slipcar.planner.problem.feasibility import LEAST_MOVE, TINY, end_sizes, path_sizes
 from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model, model_of
 
@@ -76,14 +78,38 @@ def first_order(
     return FirstOrder(lin, weights, convexify(model, lin, variance=variance))
 
 
-def adjoint_of(at: FirstOrder, terminal: Array) -> Array:
-    """λ_1..λ_K by the adjoint recursion from ν = −𝔭 (q,): (K, n), gradients of the cost to go."""
-    A = at.lin.A
+def adjoint_of(model: Model, at: FirstOrder, terminal: Array) -> Array:
+    """λ_1..λ_K by the adjoint recursion from ν = −𝔭 (q,): (K, n), gradients of the cost to go.
+
+        λ_k = ∇ℓ_k + A_kᵀ λ_{k+1} + K_kᵀ γ_k,    γ_k = ∂H_k/∂u
+
+    with a feedback K of the controls that are within their bounds: at an extremal, where their γ
+    vanishes, it is the recursion without K, and it is bounded where that one is not, for unstable
+    systems.
+    """
+    A, B, sub, u = at.lin.A, at.lin.B, at.sub, at.lin.u
+    inside = (u > model.lower) & (u < model.upper)
+    if model.radius < np.inf:
+        inside &= (np.linalg.norm(u, axis=1) < (1.0 - 1e-9) * model.radius)[:, None]
+    gains = _gains(at, model.dt)
     adjoint = at.state_gradient
     adjoint[-1] += at.lin.G.T @ terminal
     for k in range(len(A) - 1, 0, -1):
-        adjoint[k - 1] += A[k].T.dot(adjoint[k])
+        slope = sub.r[k] + B[k].T.dot(adjoint[k])
+        adjoint[k - 1] += A[k].T.dot(adjoint[k]) + gains[k].T.dot(inside[k] * slope)
     return adjoint
+
+
+def _gains(at: FirstOrder, dt: Array) -> Array:
+    """Feedback that holds the states where they are, in their own sizes (Bryson's rule)."""
+    A, B, R = at.lin.A, at.lin.B, at.sub.R
+    weight = float(np.einsum("ki,kij,kj->", at.lin.u, R, at.lin.u)) / float(dt.sum()) + TINY
+    D = np.diag(weight / np.square(states_moved(at)))
+    P, gains = D * dt[-1], np.empty((*B.shape[:1], *B.shape[:0:-1]))
+    for k in range(len(A) - 1, -1, -1):
+        gains[k] = gain(A[k], B[k], P, R[k])
+        P = D * dt[k] + weight_step(A[k], B[k], P, gains[k], R[k], None, dt[k])
+    return gains
 
 
 def best_step(model: Model, at: FirstOrder, adjoint: Array) -> tuple[Array, Array]:
@@ -144,19 +170,34 @@ def _minimize_over_box(R: Array, r: Array, lower: Array, upper: Array) -> Array:
 class Scales:
     """What counts as one in each residual, in the problem's own units."""
 
-    state: float  # 1 + max |x|, for defects and the terminal residual
-    control: float  # max |u|; at least what moves the state by 1e-3 of its scale over the horizon
-    adjoint: float  # max |λ|; at least what such a control would answer to
+    state: Array  # (n,), how far each state moves
+    end: Array  # (q,), how far each terminal condition moves with them
+    control: Array  # (m,), the controls' size, shared out by their weights
+    adjoint: Array  # (n,), largest |λ| of each; at least a part of what the cost amounts to
 
 
-def scales(at: FirstOrder, adjoint: Array) -> Scales:
+def states_moved(at: FirstOrder) -> Array:
+    """How far each state moves along a trajectory, (n,)."""
+    lin = at.lin
+    terms = np.abs(lin.A) @ np.abs(lin.x[:-1, :, None]) + np.abs(lin.B) @ np.abs(lin.u[..., None])
+    return np.asarray(path_sizes(np.ptp(lin.x, axis=0), terms.max(axis=0)[:, 0], lin.A[0]))
+
+
+def scales(model: Model, at: FirstOrder, adjoint: Array) -> Scales:
     """Natural scales at a trajectory and its adjoint λ (K, n)."""
-    state = 1.0 + float(np.max(np.abs(at.lin.x)))
-    reach = np.abs(at.lin.B)
-    control = 1e-3 * state / max(float(np.max(reach.sum(axis=0))), 1e-300)
-    answer = float(np.max(np.abs(at.sub.R))) * control / max(float(reach.max()), 1e-300)
-    control = max(float(np.max(np.abs(at.lin.u))), control)
-    return Scales(state, control, max(float(np.max(np.abs(adjoint))), answer))
+    lin, weight = at.lin, np.diagonal(model.R)
+    state = states_moved(at)
+    # From where the control's own cost is least; at least what moves a state a little.
+    own = lin.u + (at.sub.r - 2.0 * model.dt[:, None] * (lin.u @ model.R)) / (
+        2.0 * model.dt[:, None] * weight
+    )
+    rate = np.max(np.abs(lin.B).sum(axis=0) / state[:, None], axis=0)
+    least = np.divide(LEAST_MOVE, rate, out=np.zeros_like(rate), where=rate > 0.0)
+    size = np.sqrt(max(float((own * own @ weight).max()), float(weight @ (least * least))) + TINY)
+    costate = np.abs(adjoint).max(axis=0)
+    answer = LEAST_MOVE * size * size * float(model.dt.sum()) / state
+    end = np.asarray(end_sizes(lin.G, state))
+    return Scales(state, end, size / np.sqrt(weight), np.maximum(costate, answer))
 
 
 def time_slope(model: Model, at: FirstOrder, adjoint: Array, variance_weight: float) -> float:

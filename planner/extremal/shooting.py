@@ -127,8 +127,8 @@ def shoot(
     began = time.perf_counter()
     start = first_order(model, x, u, variance_weight)
     if adjoint is None:
-        adjoint = adjoint_of(start, terminal)
-    conditions = Conditions(model, variance_weight, terminal_tolerance, scales(start, adjoint))
+        adjoint = adjoint_of(model, start, terminal)
+    conditions = Conditions(model, variance_weight, terminal_tolerance, scales(model, start, adjoint))
     here = conditions.at(x, u, adjoint, terminal)
     history = [_row(here, 0.0, began)]
     attempted = here.largest <= start_within

@@ -192,7 +192,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "d": Field((n,)), "e": Field((m,)), "held": Field((m,)), "passed": Field((m,)),
         "V": Field((size * (size + 1) // 2,)), "law": Field((m, size)),
         "Q": Field((n, n)), "q": Field((n,)), "Rk": Field((m, m)), "rk": Field((m,)),
-        "S": Field((m, n)), "P": Field((n, n)), "Sigma": Field((n, n)), "H_psd": Field((n, n)),
+        "S": Field((m, n)), "costate": Field((n,)), "P": Field((n, n)), "Sigma": Field((n, n)), "H_psd": Field((n, n)),
         "evaluated": Field((len(Evaluation._fields),), True),
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
@@ -550,6 +550,7 @@ class Equations:
         q = self._gradient(rows) + dt * p.d_ell.T.dot(u) + noise
         inside = choose(rows["upper"] - u, choose(u - rows["lower"], 1.0 + 0.0 * u, 0.0), 0.0)
         terms = magnitude(A).dot(magnitude(x)) + magnitude(B).dot(magnitude(u))
+        rows.write_ahead("costate", adjoint)
         answered = rows["law"][:, : self.dims.n].T.dot(inside * slope)
         return {
             "adjoint": q + A.T.dot(adjoint) - answered,

@@ -126,7 +126,9 @@ def _outcome(
         effort=at.effort,
         penalty=at.penalty,
         running=at.running,
-        adjoint=workspace.at(side, "lam")[1:].copy(),
+        adjoint=(workspace.arrays["costate"] if ending.status.ok else workspace.at(side, "lam"))[
+            1:
+        ].copy(),
         terminal=workspace.at(side, "nu")[0].copy(),
         trust_multiplier=0.0,
         iterations=ending.tried,
