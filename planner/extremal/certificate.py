@@ -91,8 +91,8 @@ def violations(
     of the terminal box.
     """
     at = first_order(model, x, u, variance_weight)
-    adjoint = adjoint_of(model, at, terminal)
-    e, gain = best_step(model, at, adjoint)
+    plain, closed = (_maximality(model, at, terminal, answered) for answered in (False, True))
+    adjoint, e, gain = plain if _largest(plain[1]) <= 10.0 * _largest(closed[1]) else closed
     beyond = np.maximum(np.abs(at.lin.g) - terminal_tolerance, 0.0)
     out, units = model.admissible(u) - u, scales(model, at, adjoint)
     return Violations(
@@ -109,6 +109,14 @@ def violations(
         adjoint=adjoint,
         scales=units,
     )
+
+
+def _maximality(
+    model: Model, at: FirstOrder, terminal: Array, answered: bool
+) -> tuple[Array, Array, Array]:
+    """An adjoint, the way to argmax_U H, and what that gains: either adjoint proves an extremal."""
+    adjoint = adjoint_of(model, at, terminal, answered=answered)
+    return adjoint, *best_step(model, at, adjoint)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -78,20 +78,22 @@ def first_order(
     return FirstOrder(lin, weights, convexify(model, lin, variance=variance))
 
 
-def adjoint_of(model: Model, at: FirstOrder, terminal: Array) -> Array:
+def adjoint_of(
+    model: Model, at: FirstOrder, terminal: Array, *, answered: bool = False
+) -> Array:
     """λ_1..λ_K by the adjoint recursion from ν = −𝔭 (q,): (K, n), gradients of the cost to go.
 
         λ_k = ∇ℓ_k + A_kᵀ λ_{k+1} + K_kᵀ γ_k,    γ_k = ∂H_k/∂u
 
-    with a feedback K of the controls that are within their bounds: at an extremal, where their γ
-    vanishes, it is the recursion without K, and it is bounded where that one is not, for unstable
-    systems.
+    If `answered`, with a feedback K of the controls that are within their bounds. At an extremal,
+    where their γ vanishes, that is the recursion without K, and it is bounded where that one is
+    not, for unstable systems.
     """
     A, B, sub, u = at.lin.A, at.lin.B, at.sub, at.lin.u
     inside = (u > model.lower) & (u < model.upper)
     if model.radius < np.inf:
         inside &= (np.linalg.norm(u, axis=1) < (1.0 - 1e-9) * model.radius)[:, None]
-    gains = _gains(at, model.dt)
+    gains = _gains(at, model.dt) if answered else np.zeros((len(A), *B.shape[:0:-1]))
     adjoint = at.state_gradient
     adjoint[-1] += at.lin.G.T @ terminal
     for k in range(len(A) - 1, 0, -1):

@@ -60,6 +60,7 @@ KNOBS = (
     "variance_weight",  # w
     "closed",  # 1 with feedback
     "saturation",  # bounds are kept at so many standard deviations of the correction
+    "answered",  # 1 takes the adjoint along the paths that the step's feedback leads to
     "renewal",  # the part of a change of rows' weights that is taken over, in (0, 1]
 )
 
@@ -532,11 +533,11 @@ class Equations:
         }  # fmt: skip
 
     def _residuals(self, rows: Rows, carried: Carried) -> Carried:
-        """The adjoint μ along the paths that the last step's feedback K leads to.
+        """The adjoint μ, also along the paths that the last step's feedback K leads to.
 
             μ_k = ∇ℓ_k + A_kᵀ μ_{k+1} + K_kᵀ γ_k,    γ_k = ∂H_k/∂u
 
-        It is the one without K where γ = 0, and bounded for unstable systems; controls at their
+        With K it is the same where γ = 0, and bounded for unstable systems; controls at their
         bounds take no part in K.
         """
         p, dt, x, u, adjoint = (
@@ -551,9 +552,9 @@ class Equations:
         inside = choose(rows["upper"] - u, choose(u - rows["lower"], 1.0 + 0.0 * u, 0.0), 0.0)
         terms = magnitude(A).dot(magnitude(x)) + magnitude(B).dot(magnitude(u))
         rows.write_ahead("costate", adjoint)
-        answered = rows["law"][:, : self.dims.n].T.dot(inside * slope)
+        closed = self._knob(rows, "answered") * rows["law"][:, : self.dims.n]
         return {
-            "adjoint": q + A.T.dot(adjoint) - answered,
+            "adjoint": q + A.T.dot(adjoint) - closed.T.dot(inside * slope),
             "off": larger(weight.dot(off * off), carried["off"]),
             "size": larger(weight.dot(own * own), carried["size"]),
             "gap": carried["gap"] + magnitude(rows["f"]),

@@ -48,9 +48,9 @@ from slipcar.planner.status import Status
 
 Array = np.ndarray
 
-_ALPHA, _DAMPING, _KAPPA, _HINGES, _CURVED, _CLIPPED, _RENEWAL = (
+_ALPHA, _DAMPING, _KAPPA, _HINGES, _CURVED, _CLIPPED, _ANSWERED, _RENEWAL = (
     KNOBS.index(name)
-    for name in ("alpha", "damping", "kappa", "hinges", "curved", "clipped", "renewal")
+    for name in ("alpha", "damping", "kappa", "hinges", "curved", "clipped", "answered", "renewal")
 )
 
 
@@ -229,7 +229,7 @@ class Iteration:
             self.tried += 1
             shift, there, status = self.shift if curved else 0.0, 1 - self.side, None
             if trial.accepted:
-                settling = trial.length
+                settling = self.length = trial.length
                 self._accepted(step, trial, newton)
                 if not released and self._extremal():
                     status = Status.CONVERGED
@@ -455,10 +455,18 @@ class Iteration:
         at = self.at
         if at.gap + at.miss > self.tuning.defective * (abs(at.effort) + abs(at.running)):
             return False  # not worth a closer look
-        self.workspace.kernels["residuals"][self.side]()
-        off, tuning = self.workspace.residuals(), self.tuning
-        feasible = off.gap <= tuning.consistency and off.end <= tuning.feasibility
-        return bool(feasible and off.control <= self.task.tolerance)
+        tuning = self.tuning
+        for answered in (0.0, 1.0):
+            self._knobs[_ANSWERED] = answered
+            self.workspace.kernels["residuals"][self.side]()
+            off = self.workspace.residuals()
+            if not (off.gap <= tuning.consistency and off.end <= tuning.feasibility):
+                return False
+            if off.control <= self.task.tolerance:
+                return True
+            if self.length > 1e-4 * self.task.tolerance * at.effort:
+                return False
+        return False
 
     def _tell(
         self, step: _Step, trial: _Trial, shift: float, there: int, linearizing: float,
