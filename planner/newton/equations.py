@@ -198,7 +198,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
         "verified": Field((len(Residuals._fields),), True), "price": Field((n,), True),
-        "reach": Field((q,), True), "late": Field(()), "noise": Field((), True),
+        "reach": Field((q,), True), "late": Field(()), "stiff": Field((n,), True), "noise": Field((), True),
     }  # fmt: skip
     if form.noisy:
         fields |= {
@@ -330,7 +330,9 @@ class Equations:
         return Q, q
 
     def _loaded(self, rows: Rows, Q: Array, q: Array, loss: Loss) -> tuple[Array, Array]:
-        """With the hinges that are on, where rows are certain."""
+        """With the hinges that are on, where rows are certain, and the shift."""
+        shift = (2.0 * self._knob(rows, "damping") * rows["dn"]) * rows["stiff"]
+        Q = Q + np.eye(self.dims.n) * shift
         if self.form.noisy:
             return Q, q
         return self._with_rows(Q, q, loss.scaled(self._knob(rows, "hinges")), rows["C"])

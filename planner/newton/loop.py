@@ -177,7 +177,7 @@ class Iteration:
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
-        self.hopeless, self.curvature = 0, 1.0
+        self.hopeless, self.curvature, self.measured = 0, 1.0, False
         self._bent = False
 
     def run(self) -> Ending:
@@ -217,6 +217,8 @@ class Iteration:
             )
             fallback = tuning.falls_back and self.rejected >= tuning.rejections
             curved = newton and not fallback
+            if newton and not self.measured:
+                self._measure()
             if self.noisy and task.bounded:
                 self._confine()
             self._prepare(curved)
@@ -255,6 +257,14 @@ class Iteration:
         self._evaluate[side]()
         evaluation: Evaluation = self.workspace.evaluation()
         return evaluation
+
+    def _measure(self) -> None:
+        """What a state's shift is worth: as much as the effort where it moves by its size."""
+        ws, self.measured = self.workspace, True
+        t = ws.arrays["t"]
+        rate = self.at.effort / (t[-1, 0] - t[0, 0])
+        moved = np.ptp(ws.at(self.side, "x"), axis=0)
+        ws.arrays["stiff"][0] = np.divide(self.tuning.statewise * rate, moved * moved, out=np.zeros_like(moved), where=moved > 0.0)
 
     def _believe(self, fresh: bool = False) -> None:
         """Let the belief follow the iterate: what noise is charged, and gains."""

@@ -63,7 +63,8 @@ class Tuning(NamedTuple):
     least_renewal: float = 0.05
     dearest: float = 1e12
     noise: float = 1e-9
-    largest_shift: float = 0.5
+    statewise: float = 1.0
+    largest_shift: float = 100
     least_curvature: float = 0.05
     bent: float = 0.5
     defective: float = 0.1
