@@ -64,7 +64,7 @@ class Tuning(NamedTuple):
     dearest: float = 1e12
     noise: float = 1e-9
     statewise: float = 1.0
-    largest_shift: float = 100
+    largest_shift: float = 0.5
     least_curvature: float = 0.05
     bent: float = 0.5
     defective: float = 0.1
