@@ -177,7 +177,7 @@ class Iteration:
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
-        self.hopeless, self.curvature, self.measured = 0, 1.0, False
+        self.hopeless, self.curvature, self.measured, self.bold = 0, 1.0, False, True
         self._bent = False
 
     def run(self) -> Ending:
@@ -208,11 +208,13 @@ class Iteration:
         for iteration in range(task.max_iterations):
             effort = self.at.effort
             if released and (
-                settling < tuning.released * effort or iteration >= tuning.released_steps
+                settling < tuning.released * effort
+                or iteration >= tuning.released_steps
+                or not self.bold
             ):
                 released = False
             newton = not released and (
-                iteration >= tuning.free_steps
+                iteration >= tuning.free_steps or not self.bold
                 or (self.tried > 0 and settling < tuning.settled * effort)
             )
             fallback = tuning.falls_back and self.rejected >= tuning.rejections
@@ -380,7 +382,8 @@ class Iteration:
         descent += factor * lacking
         before = at.effort + at.running + model.charged + promise.pull + factor * lacking
         predicted = promise.pull - promise.change + factor * lacking
-        noise = tuning.noise * (at.effort + abs(at.running) + model.charged + abs(promise.pull))
+        size = at.effort + abs(at.running) + model.charged + abs(promise.pull)
+        noise = tuning.noise * size
         most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
@@ -397,7 +400,7 @@ class Iteration:
             merit += factor * 0.5 * (new.gap + new.miss)
             actual = before - merit
             accepted = math.isfinite(merit) and (
-                not newton
+                (not newton and actual >= -tuning.boldness * (descent + size))
                 or (descent <= noise and actual >= -noise)
                 or actual >= tuning.armijo * alpha * descent
             )
@@ -418,7 +421,8 @@ class Iteration:
         """Shorten the next step; a status where there is no point in trying it."""
         tuning = self.tuning
         if not newton:
-            return Status.SOLVER_FAILED
+            self.bold = False
+            return None
         if fallback:
             return Status.STALLED
         self.rejected += 1

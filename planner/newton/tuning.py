@@ -63,6 +63,7 @@ class Tuning(NamedTuple):
     least_renewal: float = 0.05
     dearest: float = 1e12
     noise: float = 1e-9
+    boldness: float = 3.0
     statewise: float = 1.0
     largest_shift: float = 0.5
     least_curvature: float = 0.05
