@@ -56,7 +56,7 @@ class Options:
     solver: str | Solver = "structured"
     method: str = "auto"
     tolerance: float = 1e-4
-    max_iterations: int = 100
+    max_iterations: int = 200
     trust_region: str | None = None
     linearization: str = "composite"
     terminal_tolerance: float = 0.0

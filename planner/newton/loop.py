@@ -384,7 +384,8 @@ class Iteration:
         predicted = promise.pull - promise.change + factor * lacking
         size = at.effort + abs(at.running) + model.charged + abs(promise.pull)
         noise = tuning.noise * size
-        most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
+        longest = tuning.longest if self.bold else min(tuning.longest, tuning.careful)
+        most = longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
         there = 1 - self.side
@@ -400,7 +401,7 @@ class Iteration:
             merit += factor * 0.5 * (new.gap + new.miss)
             actual = before - merit
             accepted = math.isfinite(merit) and (
-                (not newton and actual >= -tuning.boldness * (descent + size))
+                (not newton and actual >= -tuning.boldness * (descent + size - abs(promise.pull)))
                 or (descent <= noise and actual >= -noise)
                 or actual >= tuning.armijo * alpha * descent
             )

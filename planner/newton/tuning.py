@@ -63,7 +63,8 @@ class Tuning(NamedTuple):
     least_renewal: float = 0.05
     dearest: float = 1e12
     noise: float = 1e-9
-    boldness: float = 3.0
+    careful: float = 0.3
+    boldness: float = 2.0
     statewise: float = 1.0
     largest_shift: float = 0.5
     least_curvature: float = 0.05

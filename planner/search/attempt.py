@@ -35,7 +35,7 @@ Array = np.ndarray
 #: Newton's method has so many iterations to itself, and this part of those beyond; the rest is
 #: for the convex one. (On 1500 random worlds it took 65 at most; where it takes more, it goes
 #: round in circles, as a rule because the end cannot be reached, and only the other can tell.)
-_OWN, _SHARED = 60, 0.25
+_OWN, _SHARED = 60, 0.8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
