@@ -441,7 +441,7 @@ class Iteration:
         self.hopeless = self.hopeless + 1 if newton and dear else 0
         if newton:
             least = tuning.first_shift
-            self.stale += 1
+            self.stale += self.charged or trial.actual < 0.7 * trial.predicted
             if trial.length < 0.5 * self.shortest:
                 self.shortest, self.stale = trial.length, 0
                 self.floor /= tuning.shift_up
@@ -479,7 +479,7 @@ class Iteration:
                 return False
             if off.control <= self.task.tolerance:
                 return True
-            if self.length > 1e-4 * self.task.tolerance * at.effort:
+            if self.length > 1e-8 * self.task.tolerance * at.effort:
                 return False
         return False
 
