@@ -441,7 +441,7 @@ class Iteration:
         self.hopeless = self.hopeless + 1 if newton and dear else 0
         if newton:
             least = tuning.first_shift
-            self.stale += self.charged or trial.actual < 0.7 * trial.predicted
+            self.stale += self.charged or trial.actual < 0.1 * trial.predicted
             if trial.length < 0.5 * self.shortest:
                 self.shortest, self.stale = trial.length, 0
                 self.floor /= tuning.shift_up
@@ -458,7 +458,7 @@ class Iteration:
         """Less after a step that did what the model said, more after one that did not."""
         tuning, shift = self.tuning, self.shift
         least = 0.01 * tuning.first_shift
-        fulfilled = trial.actual > 0.7 * trial.predicted or trial.predicted <= trial.noise
+        fulfilled = trial.actual > 0.5 * trial.predicted or trial.predicted <= trial.noise
         if trial.alpha == 1.0 and fulfilled:
             return shift / tuning.shift_down if shift > least else 0.0
         if trial.alpha < 0.3 or trial.actual < 0.1 * trial.predicted:
