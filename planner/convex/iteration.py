@@ -3,7 +3,7 @@
     repeat   linearise at (u_k, μ_k)            problem.linearization, moments
              solve the convex sub-problem       subproblem, solvers
              accept or shorten                  merit, trust_region
-    until    ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt ≤ tolerance
+    until    ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt ≤ tolerance ∫ ‖u_k‖² dt,  ‖u‖² = uᵀRu
 
 and the mean is, to first order, what the controls do: over long horizons and for cheap controls
 the step alone says little about the path.
@@ -42,7 +42,7 @@ Array = np.ndarray
 #: it is raised tenfold; and the part of the virtual control that this must remove to go on.
 _FIRST_RHO, _RAISES, _WORTHWHILE = 1e3, 3, 0.01
 #: A converged plan leaves no more than this between its mean and the path that its controls
-#: lead to, per unit of the state.
+#: lead to, relative to how far each state moves.
 _CONSISTENCY = 1e-4
 #: Control bounds act once ∫ ‖u_{k+1} − u_k‖² dt is this small beside ∫ ‖u_{k+1}‖² dt.
 _SHORT = 0.03
@@ -69,8 +69,8 @@ def iterate(
     options = dataclasses.replace(options, max_iterations=left)
     careful = _Attempt(model, solver, cautious, options, x, u).run()
     off_careful, off_bold = (
-        feasibility.inconsistency(linearize(model, end.x, end.u), options.terminal_tolerance)
-        for end in (careful, bold)
+        max(feasibility.inconsistency(at), feasibility.lacks(at, options.terminal_tolerance).max())
+        for at in (linearize(model, end.x, end.u) for end in (careful, bold))
     )
     better = careful.status in (Status.CONVERGED, Status.STOPPED) or off_careful < off_bold
     history = (*bold.history, *careful.history)
@@ -87,6 +87,8 @@ class _Proposal:
     radius: float  # ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts
     multiplier: float  # of the trust region, −p¹
     step: float  # ∫ ‖u_{k+1} − u_k‖² dt
+    length: float  # the same in the norm of R
+    short: float  # what the solution leaves of the terminal condition, relative
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +153,7 @@ class _Attempt:
             unlimited = self.limit_controls(proposal, new, accepted)
             stop = options.callback is not None and options.callback(self.history[-1])
             if accepted:
-                status = self.accept(proposal, new, np.inf if unlimited else proposal.step)
+                status = self.accept(proposal, new, np.inf if unlimited else proposal.length)
                 if status is not None:
                     return self.outcome(status)
             elif trust.collapsed:
@@ -175,7 +177,7 @@ class _Attempt:
             )  # fmt: skip
             solution = self.solver.solve(sub)
             if not solution.found:
-                return _Proposal(solution, np.nan, np.nan, multiplier, np.nan)
+                return _Proposal(solution, np.nan, np.nan, multiplier, np.nan, np.nan, np.nan)
             d = solution.d
             if weight is None:
                 radius = float(np.vdot(model.dt[:, None] * d, d))
@@ -183,8 +185,12 @@ class _Attempt:
                 radius = 0.5 * float(np.vdot(d, np.matmul(weight, d[..., None])[..., 0]))
             if trust.fits(radius):
                 break
-        step = float(np.vdot(model.dt[:, None] * solution.e, solution.e))
-        return _Proposal(solution, sub.virtual_control(d), radius, multiplier, step)
+        e = model.dt[:, None] * solution.e
+        step, length = float(np.vdot(e, solution.e)), float(np.vdot(e @ model.R, solution.e))
+        lin = self.at.lin
+        short = feasibility.lacks(lin, options.terminal_tolerance, lin.g + lin.G @ d[-1]).max()
+        lacking = sub.virtual_control(d)
+        return _Proposal(solution, lacking, radius, multiplier, step, length, float(short))
 
     def trust_weight(self) -> Array:
         """Hessian blocks of ∫ E‖x − x_k‖² dt: those of the variance penalty, but for its weight."""
@@ -207,7 +213,7 @@ class _Attempt:
         promised = constant + solution.objective - proposal.multiplier * proposal.radius
         predicted = before - promised
         new = iterate_at(model, options.variance_weight, x, lin.u + solution.e)
-        far = proposal.step + self.last_step > options.tolerance
+        far = proposal.length + self.last_step > options.tolerance * lin.effort
         free = trust.accelerates and self.relaxed is None and proposal.multiplier == 0.0
         if far and free and self.acceleration.observe(lin.u, x, solution.e):
             new = self.accelerated(new, merit, before, predicted)
@@ -245,33 +251,32 @@ class _Attempt:
         """Go to the new iterate; CONVERGED or INFEASIBLE if the iteration has settled there."""
         self.at, self.trust_multiplier = new.at, proposal.multiplier
         self.adjoint, self.terminal = proposal.solution.adjoint, proposal.solution.terminal
-        lacking, size = proposal.lacking, self.size
-        feasible = lacking <= feasibility.FEASIBILITY * size
+        lacking, lin = proposal.lacking, self.at.lin
+        feasible = proposal.short <= feasibility.FEASIBILITY
         # Where a trust region is needed to the end, a short step proves nothing by itself:
         # the force it stands for, p¹ (x − x_k), must vanish too (beside that of the terminal
         # penalty, where it is at its limit).
         force = proposal.multiplier * (1.0 if feasible else self.first_rho / self.rho)
         step += force**2 * proposal.radius
-        settled = step + self.last_step <= self.options.tolerance
+        settled = step + self.last_step <= self.options.tolerance * lin.effort
         self.last_step = step
         if not settled:
             return None
         tau = self.options.terminal_tolerance
-        if not feasibility.inconsistency(self.at.lin, tau, lacking) <= _CONSISTENCY * size:
+        if not feasibility.inconsistency(lin) <= _CONSISTENCY:
             return None
         if feasible:
-            return Status.CONVERGED
+            met = feasibility.lacks(lin, tau).max() <= feasibility.FEASIBILITY
+            return Status.CONVERGED if met else None
+        beyond = float(np.maximum(np.abs(lin.g) - tau, 0.0).sum())
+        if not abs(beyond - lacking) <= _CONSISTENCY * lacking:
+            return None
         if self.raises == _RAISES or lacking > (1.0 - _WORTHWHILE) * self.lacked:
             return Status.INFEASIBLE
         self.acceleration.forget()
         self.rho, self.raises, self.lacked = 10.0 * self.rho, self.raises + 1, lacking
         self.last_step = np.inf
         return None
-
-    @property
-    def size(self) -> float:
-        """What counts as one in the state."""
-        return 1.0 + float(np.abs(self.at.lin.x).max())
 
     def record(
         self, proposal: _Proposal, new: _Candidate, accepted: bool, seconds: tuple[float, float]
@@ -296,7 +301,8 @@ class _Attempt:
         """What has been reached, with controls that are admissible however it ended."""
         model, weight, lin = self.model, self.options.variance_weight, self.at.lin
         if status is Status.INFEASIBLE:
-            message = feasibility.what_lacks(lin, self.options.terminal_tolerance, self.size)
+            named = feasibility.what_lacks(lin, self.options.terminal_tolerance)
+            message = f"the terminal condition is out of reach; nearest path: {named}"
         if not status.ok and not np.array_equal(inside := model.admissible(lin.u), lin.u):
             lin = linearize(model, lin.x, inside)
         return Outcome.at(

@@ -26,7 +26,7 @@ import numpy as np
 from slipcar.planner.convex.subproblem import Subproblem, convexify, variance_of
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.moments.propagation import gain, weight_step
-from slipcar.planner.problem.feasibility import LEAST_MOVE, TINY, end_sizes, path_sizes
+from slipcar.planner.problem.feasibility import LEAST_MOVE, TINY, end_sizes, states_moved
 from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model, model_of
 
@@ -106,7 +106,7 @@ def _gains(at: FirstOrder, dt: Array) -> Array:
     """Feedback that holds the states where they are, in their own sizes (Bryson's rule)."""
     A, B, R = at.lin.A, at.lin.B, at.sub.R
     weight = float(np.einsum("ki,kij,kj->", at.lin.u, R, at.lin.u)) / float(dt.sum()) + TINY
-    D = np.diag(weight / np.square(states_moved(at)))
+    D = np.diag(weight / np.square(states_moved(at.lin)))
     P, gains = D * dt[-1], np.empty((*B.shape[:1], *B.shape[:0:-1]))
     for k in range(len(A) - 1, -1, -1):
         gains[k] = gain(A[k], B[k], P, R[k])
@@ -178,17 +178,10 @@ class Scales:
     adjoint: Array  # (n,), largest |λ| of each; at least a part of what the cost amounts to
 
 
-def states_moved(at: FirstOrder) -> Array:
-    """How far each state moves along a trajectory, (n,)."""
-    lin = at.lin
-    terms = np.abs(lin.A) @ np.abs(lin.x[:-1, :, None]) + np.abs(lin.B) @ np.abs(lin.u[..., None])
-    return np.asarray(path_sizes(np.ptp(lin.x, axis=0), terms.max(axis=0)[:, 0], lin.A[0]))
-
-
 def scales(model: Model, at: FirstOrder, adjoint: Array) -> Scales:
     """Natural scales at a trajectory and its adjoint λ (K, n)."""
     lin, weight = at.lin, np.diagonal(model.R)
-    state = states_moved(at)
+    state = states_moved(lin)
     # From where the control's own cost is least; at least what moves a state a little.
     own = lin.u + (at.sub.r - 2.0 * model.dt[:, None] * (lin.u @ model.R)) / (
         2.0 * model.dt[:, None] * weight

@@ -177,7 +177,7 @@ class Iteration:
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
-        self.hopeless, self.curvature, self.measured, self.bold = 0, 1.0, False, True
+        self.hopeless, self.curvature, self.measured, self.bold = 0, 1.0, False, tuning.free_steps > 0
         self._bent = False
 
     def run(self) -> Ending:

@@ -14,7 +14,7 @@ from slipcar.planner.newton.equations import Form
 from slipcar.planner.newton.loop import Ending, StepTaken, Task, iterate
 from slipcar.planner.newton.posing import Posed
 from slipcar.planner.newton.program import Workspace, borrow, give_back
-from slipcar.planner.newton.tuning import MEAN, NOISE
+from slipcar.planner.newton.tuning import MEAN, NOISE, Tuning
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.feasibility import not_finite
@@ -73,6 +73,7 @@ def solve_mean(
     u: Array,
     *,
     free_first: bool,
+    tuning: Tuning = MEAN,
     history: bool = True,
 ) -> Outcome:
     """A plan of the mean from the guess x (N, n), u (K, m).
@@ -83,6 +84,7 @@ def solve_mean(
         x: states.
         u: controls.
         free_first: leave the penalties out at first.
+        tuning: numbers of the method.
         history: keep every step.
 
     Raises:
@@ -98,7 +100,7 @@ def solve_mean(
         variance_weight=w,
     )  # fmt: skip
     steps = _Steps(workspace, options.callback) if history or options.callback else None
-    ending = iterate(workspace, task, MEAN, posed.filler, None if steps is None else steps.watch)
+    ending = iterate(workspace, task, tuning, posed.filler, None if steps is None else steps.watch)
     if ending.status is None:
         raise ValueError(f"{not_finite(linearize(model, x, u))} is not finite along the guess")
     outcome = _outcome(workspace, model, ending, w, steps.columns() if steps else ())

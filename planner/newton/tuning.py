@@ -74,6 +74,8 @@ class Tuning(NamedTuple):
     consistency: float = 1e-5
 
 
-#: Of plans of the mean; and of plans that count the noise, which start from one of them.
+#: Of plans of the mean; with every step judged; and of plans that count the noise, which start from
+#: one of them.
 MEAN = Tuning()
+JUDGED = MEAN._replace(free_steps=0)
 NOISE = MEAN._replace(free_steps=0, searches=6, rejections=8, falls_back=False, longest=0.1)

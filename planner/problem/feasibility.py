@@ -12,7 +12,7 @@ from slipcar.planner.trace.elementwise import magnitude
 
 Array = np.ndarray
 
-#: A converged plan leaves no more than this of the terminal condition, per unit of the state.
+#: A converged plan leaves no more than this of a terminal condition, relative to its moves.
 FEASIBILITY = 1e-6
 
 #: Of what a state is put together from, this part may be rounding.
@@ -63,28 +63,43 @@ def terminal_force(model: Model, at: Linearization) -> float:
     return float(np.linalg.norm(missing)) / strength if strength > 0.0 else 0.0
 
 
-def inconsistency(at: Linearization, tolerance: float, lacking: float = 0.0) -> float:
-    """How far, to first order, the mean is from the path that the controls lead to.
+def states_moved(at: Linearization) -> Array:
+    """How far each state moves along a trajectory, (n,)."""
+    terms = np.abs(at.A) @ np.abs(at.x[:-1, :, None]) + np.abs(at.B) @ np.abs(at.u[..., None])
+    return np.asarray(path_sizes(np.ptp(at.x, axis=0), terms.max(axis=0)[:, 0], at.A[0]))
 
-    The defects carried forward along the linearised dynamics; and the terminal residual beyond
-    what the sub-problem said is lacking.
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def inconsistency(at: Linearization) -> float:
+    """How far, to first order, the mean is from the path of its controls, relative to its moves.
+
+    The defects carried forward along the linearised dynamics.
     """
-    gap, worst = np.zeros(at.x.shape[1]), 0.0
+    gap, worst = np.zeros(at.x.shape[1]), np.zeros(at.x.shape[1])
     for A, defect in zip(at.A, at.defect, strict=True):
         gap = A.dot(gap) + defect
-        worst = max(worst, np.abs(gap).max())
-    beyond = np.maximum(np.abs(at.g) - tolerance, 0.0)
-    return max(worst, abs(float(beyond.sum()) - lacking))
+        worst = np.maximum(worst, np.abs(gap))
+    return float(np.max(worst / states_moved(at)))
 
 
-def what_lacks(at: Linearization, tolerance: float, size: float) -> str:
-    """Which components of the terminal condition cannot be met, and by how much."""
-    beyond = at.g - np.clip(at.g, -tolerance, tolerance)
-    worst = sorted(
-        np.flatnonzero(np.abs(beyond) > FEASIBILITY * size), key=lambda j: -abs(beyond[j])
-    )
-    named = ", ".join(f"g[{j}] = {at.g[j]:.4g}" for j in worst)
-    return f"the terminal condition is out of reach; nearest path: {named}"
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def lacks(at: Linearization, tolerance: float, g: Array | None = None) -> Array:
+    """What each terminal condition lacks beyond its tolerance, relative to its moves, (q,).
+
+    Args:
+        at: the trajectory.
+        tolerance: half-width of the terminal box.
+        g: residuals instead of the trajectory's, (q,).
+    """
+    beyond = np.maximum(np.abs(at.g if g is None else g) - tolerance, 0.0)
+    return np.asarray(beyond / end_sizes(at.G, states_moved(at)))
+
+
+def what_lacks(at: Linearization, tolerance: float) -> str:
+    """Terminal conditions that are not met, the worst first, with their residuals."""
+    relative = np.nan_to_num(lacks(at, tolerance), nan=np.inf)
+    worst = [j for j in np.argsort(-relative, kind="stable") if relative[j] > FEASIBILITY]
+    return ", ".join(f"g[{j}] = {at.g[j]:.4g}" for j in worst)
 
 
 def not_finite(at: Linearization) -> str:

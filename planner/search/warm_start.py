@@ -17,7 +17,7 @@ import numpy as np
 
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
-from slipcar.planner.problem.feasibility import inconsistency
+from slipcar.planner.problem.feasibility import inconsistency, lacks
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model, checked_trajectory
 from slipcar.planner.status import Status
@@ -76,7 +76,8 @@ def run_guarded(
     """
 
     def off(x: Array, u: Array) -> float:
-        return inconsistency(linearize(model, x, u), options.terminal_tolerance)
+        at = linearize(model, x, u)
+        return max(inconsistency(at), float(lacks(at, options.terminal_tolerance).max()))
 
     warm, own = run(*guess), model.guess()
     same = all(np.array_equal(a, b) for a, b in zip(guess, own, strict=True))
