@@ -49,6 +49,7 @@ class TracedFiller:
             "row_hessians": problem.row_hessians, "end_hessians": problem.end_hessians,
         }  # fmt: skip
         self._values = numpy_function(inputs, values, shared)
+        self._next = numpy_function(inputs, {"next": values["next"]}, shared)
         self._second = numpy_function(
             inputs, {name: _flat(graph, value) for name, value in second.items()}, shared
         )
@@ -60,6 +61,19 @@ class TracedFiller:
     def second(self, workspace: Workspace, side: int) -> None:
         """Second derivatives there."""
         self._fill(self._second, workspace, side)
+
+    def rollout(self, workspace: Workspace, side: int) -> None:
+        """The candidate that follows its dynamics, node by node."""
+        points = {name: workspace.at(side, name) for name in ("x", "u", "next")}
+        arrays = workspace.arrays
+
+        def before(k: int) -> None:
+            one = slice(k, k + 1)
+            given = {name: points[name][one] for name in ("x", "u")}
+            given |= {"t": arrays["t"][one], "dt": arrays["dt"][one], "number": arrays["number"]}
+            points["next"][one] = self._next(**given)["next"]
+
+        workspace.step_by_step("rollout", side, before)
 
     @staticmethod
     def _fill(function: Callable[..., dict[str, Array]], workspace: Workspace, side: int) -> None:
@@ -142,6 +156,17 @@ class ModelFiller:
         workspace.at(side, "g")[0] = model.terminal(x[K:])[0]
         workspace.at(side, "G")[0] = model.terminal_jacobian(x[K:])[0]
 
+    def rollout(self, workspace: Workspace, side: int) -> None:
+        """The candidate that follows its dynamics, node by node."""
+        model, arrays = self._model, workspace.arrays
+        x, u, ahead = (workspace.at(side, name) for name in ("x", "u", "next"))
+
+        def before(k: int) -> None:
+            at = (arrays["t"][k : k + 1, 0], arrays["dt"][k : k + 1, 0], x[k : k + 1], u[k : k + 1])
+            ahead[k] = (x[k : k + 1] + change(model.integrator, model.drift, *at))[0]
+
+        workspace.step_by_step("rollout", side, before)
+
     @np.errstate(all="ignore")
     def second(self, workspace: Workspace, side: int) -> None:
         """Second derivatives there, by central differences of first ones."""
@@ -176,7 +201,8 @@ class ModelFiller:
 def _differences(gradient: Callable[[Array], Array], x: Array) -> Array:
     """Symmetric Jacobian of gradients (copies, K, ..., n) -> (copies, K, ..., n) at x (K, n)."""
     K, n = x.shape
-    steps = _STEP * (1.0 + np.max(np.abs(x), axis=0))
+    size = np.max(np.abs(x), axis=0)
+    steps = _STEP * np.where(size > 0.0, size, 1.0)
     shifted = np.broadcast_to(x, (2 * n, K, n)).copy()
     for i in range(n):
         shifted[2 * i, :, i] += steps[i]

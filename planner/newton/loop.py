@@ -141,6 +141,10 @@ class Filler(Protocol):
         """Second derivatives there."""
         ...
 
+    def rollout(self, workspace: Workspace, side: int) -> None:
+        """Run the kernel `rollout`, with the dynamics node by node."""
+        ...
+
 
 #: Told of every step, and the side where its trajectory is; True stops.
 Watcher = Callable[[StepTaken, int], bool | None]
@@ -268,6 +272,13 @@ class Iteration:
         moved = np.ptp(ws.at(self.side, "x"), axis=0)
         ws.arrays["stiff"][0] = np.divide(self.tuning.statewise * rate, moved * moved, out=np.zeros_like(moved), where=moved > 0.0)
 
+    def _roll_out(self, side: int) -> None:
+        """The candidate on that side follows its dynamics and the step's law."""
+        if self.filler is not None:
+            self.filler.rollout(self.workspace, side)
+        else:
+            self._rollout[side]()
+
     def _believe(self, fresh: bool = False) -> None:
         """Let the belief follow the iterate: what noise is charged, and gains."""
         if not self.charged:
@@ -393,7 +404,7 @@ class Iteration:
         for trial in range(trials):
             self._knobs[_ALPHA] = alpha
             if rolled:
-                self._rollout[there]()
+                self._roll_out(there)
             else:
                 self._shift[self.side]()
             new = self._evaluated(there)

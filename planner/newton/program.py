@@ -247,6 +247,11 @@ class Workspace:
         )
         return x, u[:-1], nu[0]
 
+    def step_by_step(self, name: str, side: int, before: Callable[[int], None]) -> None:
+        """Run a kernel in NumPy, told of every node before its step."""
+        program = self.program
+        in_numpy(program.recursions[name], program.layout, self._sides[side], self.K, before)
+
     def _reader(self, name: str, record: Any) -> Callable[[], Any]:
         """A function that reads a row of numbers as a record."""
         buffer, new = self.view(name), tuple.__new__

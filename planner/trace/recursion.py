@@ -142,13 +142,24 @@ class NumberRows:
 
 
 @np.errstate(all="ignore")
-def in_numpy(recursion: Recursion, layout: Layout, arrays: Mapping[str, Array], K: int) -> None:
-    """Run a recursion over K intervals on arrays of numbers, node by node."""
+def in_numpy(
+    recursion: Recursion,
+    layout: Layout,
+    arrays: Mapping[str, Array],
+    K: int,
+    before: Callable[[int], None] | None = None,
+) -> None:
+    """Run a recursion over K intervals on arrays of numbers, node by node.
+
+    `before` is called with each node's number before its step, to fill in what the step reads.
+    """
     rows, down = NumberRows(layout, arrays), recursion.descending
     rows.k = K if down else 0
     carried = _plain(recursion.start(rows))
     for k in range(K - 1, -1, -1) if down else range(K):
         rows.k = k
+        if before is not None:
+            before(k)
         carried = _plain(recursion.step(rows, carried))
     if recursion.end is not None:
         rows.k = 0 if down else K
