@@ -8,6 +8,7 @@ other.
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import functools
 import struct
@@ -60,6 +61,12 @@ class Program:
     recursions: Mapping[str, Recursion]
     code: machine_code.Code | None
     filled: Filled | None
+
+
+def called_with(function: Any, K: int, table: Array) -> Callable[[], None]:
+    """A kernel over K intervals on a table of addresses, which must live as long."""
+    # ctypes takes its own integers in half the time.
+    return functools.partial(function, ctypes.c_int64(K), ctypes.c_int64(table.ctypes.data))
 
 
 def compilable(dims: Dimensions) -> bool:
@@ -117,7 +124,9 @@ def _assembly(problem: Any, recursions: Mapping[str, Recursion], fields: Layout)
         from slipcar.planner.trace.graph import Graph
 
         return emit.module(list(recursions.values()), Graph(), fields, {})
+    n = problem.dims.n
     known = {name: getattr(problem, name) for name in ("A", "B", "C", "G")}
+    known["S"] = problem.lagrangian_hessian(problem.graph.inputs("lam", (n,)))[n:, :n]
     return emit.module(list(recursions.values()), problem.graph, fields, known)
 
 
@@ -163,7 +172,8 @@ class Probe:
             for name, field in self._layout.items()
         }
         table = [array.ctypes.data for array in self._arrays.values()]
-        self._table, self._count = np.array(table, dtype=np.int64), count
+        self._table = np.array(table, dtype=np.int64)
+        self._run = called_with(self._code.short["probe"], count, self._table)
         self._lock = threading.Lock()
 
     def __call__(self, t: Array, dt: float, x: Array, u: Array, number: Array) -> Array:
@@ -172,7 +182,7 @@ class Probe:
         with self._lock:
             arrays["t"][:, 0], arrays["dt"][:, 0] = t, dt
             arrays["x"][:], arrays["u"][:], arrays["number"][0] = x, u, number
-            self._code.short["probe"](self._count, self._table.ctypes.data)
+            self._run()
             return arrays["values"].copy()
 
 
@@ -256,7 +266,7 @@ class Workspace:
             recursion = program.recursions[name]
             return functools.partial(in_numpy, recursion, program.layout, self._sides[side], self.K)
         functions = program.code.short if brief(program.dims, self.K) else program.code.long
-        return functools.partial(functions[name], self.K, self._tables[side].ctypes.data)
+        return called_with(functions[name], self.K, self._tables[side])
 
 
 def _other(name: str, fields: Layout) -> str:
