@@ -214,6 +214,11 @@ class Workspace:
             for side in (0, 1)
         ]  # fmt: skip
         self._sides = swapped
+        self._views = [
+            {name: array.reshape(len(array), *program.layout[name].shape)
+             for name, array in side.items()}
+            for side in swapped
+        ]  # fmt: skip
         self._tables = [
             np.array([a.ctypes.data for a in side.values()], dtype=np.int64) for side in swapped
         ]
@@ -240,9 +245,7 @@ class Workspace:
 
     def at(self, side: int, name: str) -> Array:
         """What a kernel on that side calls `name`, (K + 1, ...) or (1, ...)."""
-        field = self.program.layout[name]
-        array = self._sides[side][name]
-        return array.reshape(len(array), *field.shape)
+        return self._views[side][name]
 
     def trajectory(self, flat: Array) -> tuple[Array, Array, Array]:
         """States (N, n), controls (K, m) and ν (q,) of a copy of one of the `trajectories`."""

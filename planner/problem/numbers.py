@@ -19,15 +19,21 @@ def finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers, not {value!r}") from error
-    if array.ndim != len(shape) or any(
-        want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
-    ):
+    if not fits(array, shape):
         wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
         raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name}{list(index)} must be finite, not {array[index]}")
     return array
+
+
+def fits(array: Array, shape: tuple[int | None, ...]) -> bool:
+    """Whether an array has a shape, None allowing any length of an axis."""
+    return array.shape == shape or (
+        array.ndim == len(shape)
+        and all(want in (None, got) for got, want in zip(array.shape, shape, strict=True))
+    )
 
 
 def control_weight(value: Any) -> Array:
@@ -37,7 +43,9 @@ def control_weight(value: Any) -> Array:
         ValueError: if it is not.
     """
     R = finite("control_weight", value, (None, None))
-    if R.shape[0] != R.shape[1] or not np.allclose(R, R.T) or np.linalg.eigvalsh(R)[0] <= 0:
+    square = R.shape[0] == R.shape[1]
+    symmetric = square and (abs(R - R.T) <= 1e-8 + 1e-5 * abs(R)).all()
+    if not symmetric or np.linalg.eigvalsh(R)[0] <= 0:
         raise ValueError(f"control_weight must be symmetric positive definite, not {R!r}")
     return R
 
@@ -49,7 +57,7 @@ def node_times(value: Any) -> Array:
         ValueError: if they are not.
     """
     times = finite("times", value, (None,))
-    if len(times) < 2 or not (np.diff(times) > 0).all():
+    if len(times) < 2 or not (times[1:] > times[:-1]).all():
         raise ValueError(f"times must be at least 2 increasing nodes, not {times!r}")
     return times
 
@@ -63,9 +71,9 @@ def start_covariance(given: Any, n: int) -> Array:
     if given is None:
         return np.zeros((n, n))
     S = finite("start_covariance", given, (n, n))
-    largest = float(np.abs(S).max(initial=0.0))
-    if largest == 0.0:
+    if not S.any():
         return S
+    largest = float(np.abs(S).max())
     bent = np.argwhere(np.abs(S - S.T) > 1e-9 * largest)
     if len(bent):
         i, j = (int(index) for index in bent[0])
