@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -43,11 +44,16 @@ def control_weight(value: Any) -> Array:
         ValueError: if it is not.
     """
     R = finite("control_weight", value, (None, None))
-    square = R.shape[0] == R.shape[1]
-    symmetric = square and (abs(R - R.T) <= 1e-8 + 1e-5 * abs(R)).all()
-    if not symmetric or np.linalg.eigvalsh(R)[0] <= 0:
+    if not _definite(R.shape, R.tobytes()):
         raise ValueError(f"control_weight must be symmetric positive definite, not {R!r}")
     return R
+
+
+@functools.lru_cache(maxsize=64)
+def _definite(shape: tuple[int, ...], data: bytes) -> bool:
+    """Whether a matrix is symmetric and positive definite: many problems have the same."""
+    R = np.frombuffer(data).reshape(shape)
+    return shape[0] == shape[1] and np.allclose(R, R.T) and bool(np.linalg.eigvalsh(R)[0] > 0)
 
 
 def node_times(value: Any) -> Array:
