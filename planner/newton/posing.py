@@ -291,7 +291,7 @@ def check_assumptions(posed: Posed, x: Array, u: Array, *, charged: bool) -> Non
         return
     # The same lines of code, whatever numbers they read.
     functions = [getattr(posed.model.problem, name, None) for name in _FUNCTIONS]
-    lines = [getattr(getattr(f, "__func__", f), "__code__", type(f)) for f in functions]
+    lines = [getattr(function, "__code__", type(function)) for function in functions]
     kind = (posed.structure, *lines)
     if kind not in _checked:
         checks.check(posed.model, x, u, None, charged=charged)

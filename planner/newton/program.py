@@ -214,6 +214,7 @@ class Workspace:
             for side in (0, 1)
         ]  # fmt: skip
         self._sides = swapped
+        self._numbers = {name: array.reshape(-1).data for name, array in self.arrays.items()}
         self._views = [
             {name: array.reshape(len(array), *program.layout[name].shape)
              for name, array in side.items()}
@@ -241,7 +242,7 @@ class Workspace:
 
     def view(self, name: str) -> Any:
         """The numbers of an array that has one row."""
-        return self.arrays[name].reshape(-1).data
+        return self._numbers[name]
 
     def at(self, side: int, name: str) -> Array:
         """What a kernel on that side calls `name`, (K + 1, ...) or (1, ...)."""
