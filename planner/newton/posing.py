@@ -77,10 +77,11 @@ class Posed:
         if not isinstance(self.problem, Traced):
             return program_of(self.problem, form, self.structure, self.native)
         known, key = self.problem.programs, (form, self.native)
-        if key not in known:
+        program = known.get(key)
+        if program is None:
             problem = self.problem if self.native else self.problem.filled
-            known[key] = program_of(problem, form, self.structure, self.native)
-        return known[key]
+            program = known[key] = program_of(problem, form, self.structure, self.native)
+        return program
 
     @functools.cached_property
     def filler(self) -> Filler | None:

@@ -23,7 +23,8 @@ def finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
     if not fits(array, shape):
         wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
         raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
-    if not np.isfinite(array).all():
+    # A finite sum of squares says it in a third of the time.
+    if not np.vdot(array, array) < np.inf and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name}{list(index)} must be finite, not {array[index]}")
     return array
