@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from slipcar.envs.arrays import array_namespace
+from slipcar.envs.arrays import array_namespace, stacked
 
 #: State, control and Brownian dimensions. Slip has three non-zero rows, so three Brownian
 #: motions drive it; the paper's 5 x 5 diagonal is this matrix with two zero columns dropped.
@@ -61,7 +61,7 @@ def drift(x: Any, u: Any) -> Any:
     xp = array_namespace(x, u)
     theta, v = x[..., 2], x[..., 3]
     b = rates(v, x[..., 4], xp.cos(theta), xp.sin(theta), u[..., 0], u[..., 1])
-    return xp.stack(list(b), axis=-1)
+    return stacked(xp, b)
 
 
 def drift_jacobian(x: Any, u: Any) -> tuple[Any, Any]:

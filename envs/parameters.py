@@ -151,10 +151,9 @@ class Parameters(NamedTuple):
     def shaped(self, component: Any, scenario: Task) -> Parameters:
         """The same with obstacles as columns beside arrays of this kind and shape."""
         xp = array_namespace(component)
+        place = {} if xp is np else {"device": device(component)}  # NumPy 1.26 has none
         columns = xp.asarray(
-            obstacle_columns(scenario.obstacles, scenario.clearance),
-            dtype=component.dtype,
-            device=device(component),
+            obstacle_columns(scenario.obstacles, scenario.clearance), dtype=component.dtype, **place
         )
         shape = (len(columns), -1, *(1 for _ in component.shape))
         return self._replace(obstacles=tuple(xp.reshape(columns, shape)))

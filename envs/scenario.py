@@ -328,8 +328,10 @@ class Scenario:
 
     def terminal_jacobian(self, x: Any) -> Any:
         """∂g/∂x, (..., 5, 5): the identity."""
-        shape = (*x.shape[:-1], car.STATE_DIM, car.STATE_DIM)
-        return array_namespace(x).broadcast_to(_like(x, np.eye(car.STATE_DIM)), shape)
+        G = array_namespace(x).zeros((*x.shape, car.STATE_DIM), dtype=x.dtype)
+        for i in range(car.STATE_DIM):
+            G[..., i, i] = 1.0
+        return G
 
     @property
     def terminal_weight(self) -> np.ndarray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -177,9 +178,9 @@ class Guesses:
             check_number("time_weight", self.time_weight)
 
 
-def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
+def check_choice(name: str, value: Any, known: Collection[str]) -> None:
     """Raise ValueError unless the value is one of the known ones."""
-    if not isinstance(value, str) or value not in (known := list(known)):
+    if not isinstance(value, str) or value not in known:
         raise ValueError(f"unknown {name} {value!r}; known: {list(known)}")
 
 
@@ -194,8 +195,8 @@ def check_number(name: str, value: Any, *, zero_allowed: bool = False) -> None:
     """Raise ValueError unless the value is a finite number > 0 (or ≥ 0)."""
     allowed = "finite and >= 0" if zero_allowed else "finite and > 0"
     try:
-        good = bool(np.isfinite(value) and (value >= 0 if zero_allowed else value > 0))
-    except (TypeError, ValueError):  # no number, or an array of several
+        good = math.isfinite(value) and bool(value >= 0 if zero_allowed else value > 0)
+    except (TypeError, ValueError, OverflowError):  # no number, or an array of several
         good = False
     if not good:
         raise ValueError(f"{name} must be {allowed}, not {value!r}")

@@ -99,8 +99,11 @@ def plan(
 
 
 def _of(kind: Any, asked: dict[str, Any]) -> Any:
-    """The options that a record holds and describes."""
-    return kind(**{name: asked[name] for name in kind.__dataclass_fields__})
+    """The options that a record holds and describes, checked."""
+    record = object.__new__(kind)  # not field by field, as a frozen record's own __init__ does
+    vars(record).update({name: asked[name] for name in kind.__dataclass_fields__})
+    record.__post_init__()
+    return record
 
 
 class _Planning:

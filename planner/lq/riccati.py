@@ -47,8 +47,6 @@ def stage(
     """
     n, m = B.shape
     size = len(V)
-    V = V.copy()
-    V[n, n] = 0.0 * V[n, n]
     # Rows of F beyond the state's are the identity.
     F = np.zeros((size, m + size), dtype=V.dtype)
     F[:n, :m], F[:n, m : m + n], F[:n, m + n] = B, A, f
@@ -65,9 +63,11 @@ def stage(
     bad: Any = 0.0
     for i in range(m):
         bad = bad + choose(T[i, i], 0.0, 1.0)
-        row = T[i] * (1.0 / T[i, i])  # one division a pivot
-        T = T - T[:, i, None] * row
+        # T is symmetric but for the rows above, which are done; one division a pivot.
+        column, row = np.concatenate([T[:i, i], T[i, i:]]), T[i] * (1.0 / T[i, i])
+        T = T - column[:, None] * row
         T[i] = row
+    T[m + n, m + n] = 0.0
     return T[m:, m:], T[:m, m:], bad
 
 

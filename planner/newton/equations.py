@@ -191,7 +191,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "t": Field(()), "dt": Field(()), "dn": Field(()), "lower": Field((m,)),
         "upper": Field((m,)), **point, **{name + NEW: field for name, field in point.items()},
         "d": Field((n,)), "e": Field((m,)), "held": Field((m,)), "passed": Field((m,)),
-        "V": Field((size * (size + 1) // 2,)), "law": Field((m, size)),
+        "V": Field((n * (n + 1) // 2 + n * (size - n),)), "law": Field((m, size)),
         "Q": Field((n, n)), "q": Field((n,)), "Rk": Field((m, m)), "rk": Field((m,)),
         "S": Field((m, n)), "costate": Field((n,)), "P": Field((n, n)), "Sigma": Field((n, n)), "H_psd": Field((n, n)),
         "evaluated": Field((len(Evaluation._fields),), True),
@@ -364,7 +364,7 @@ class Equations:
     def _backward(self, rows: Rows, carried: Carried) -> Carried:
         p, dt, u, n = self.problem.at(rows), rows["dt"], rows["u"], self.dims.n
         V, A, B = carried["V"], rows["A"], rows["B"]
-        rows.write_ahead("V", V[np.triu_indices(len(V))])
+        rows.write_ahead("V", V[np.triu_indices(n, m=len(V))])
         Q, q, loss = self._node_model(rows)
         L = self._knob(rows, "curved") * p.lagrangian_hessian(rows.ahead("lam"))
         Q, q = Q + L[:n, :n], q + dt * p.d_ell.T.dot(u)
@@ -423,7 +423,7 @@ class Equations:
         inside = choose(above, rows["upper"] - u, choose(below, rows["lower"] - u, free))
         e = choose(self._knob(rows, "clipped") + 0.0 * u, inside, free)
         ahead = rows["A"].dot(d) + rows["B"].dot(e) + f
-        V = self._unpacked(rows.ahead("V"))
+        V = self._unpacked(rows.ahead("V"), rows["law"].shape[1])
         lam = riccati.adjoint(V, ahead, nu)
         for name, value in (("d", d), ("e", inside), ("passed", passed)):
             rows.write(name, value)
@@ -457,12 +457,13 @@ class Equations:
         )  # fmt: skip
         rows.write("promised", np.array(promise, dtype=object))
 
-    def _unpacked(self, packed: Array) -> Array:
-        size = self.dims.n + 1 + (0 if self.form.soft else self.dims.q)
-        V = np.zeros((size, size), dtype=packed.dtype)
-        V[np.triu_indices(size)] = packed
-        V.T[np.triu_indices(size)] = packed
-        return V
+    def _unpacked(self, upper: Array, size: int) -> Array:
+        """The first n rows of a symmetric matrix, (n, size), from their upper triangle."""
+        M = np.zeros((self.dims.n, size), dtype=upper.dtype)
+        M[np.triu_indices(self.dims.n, m=size)] = upper
+        below = np.tril_indices(self.dims.n, -1)
+        M[below] = M.T[below]
+        return M
 
     def _node_change(self, rows: Rows, d: Array) -> Any:
         """What the model says of a node's costs after a step d; certain rows keep their kink."""

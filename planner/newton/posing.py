@@ -77,10 +77,11 @@ class Posed:
         if not isinstance(self.problem, Traced):
             return program_of(self.problem, form, self.structure, self.native)
         known, key = self.problem.programs, (form, self.native)
-        if key not in known:
+        program = known.get(key)
+        if program is None:
             problem = self.problem if self.native else self.problem.filled
-            known[key] = program_of(problem, form, self.structure, self.native)
-        return known[key]
+            program = known[key] = program_of(problem, form, self.structure, self.native)
+        return program
 
     @functools.cached_property
     def filler(self) -> Filler | None:
@@ -291,7 +292,7 @@ def check_assumptions(posed: Posed, x: Array, u: Array, *, charged: bool) -> Non
         return
     # The same lines of code, whatever numbers they read.
     functions = [getattr(posed.model.problem, name, None) for name in _FUNCTIONS]
-    lines = [getattr(getattr(f, "__func__", f), "__code__", type(f)) for f in functions]
+    lines = [getattr(function, "__code__", type(function)) for function in functions]
     kind = (posed.structure, *lines)
     if kind not in _checked:
         checks.check(posed.model, x, u, None, charged=charged)
@@ -362,13 +363,13 @@ def _near(traced: Array, given: Array) -> bool:
 @functools.lru_cache(maxsize=64)
 def _noise(n: int, m: int) -> tuple[Array, Array]:
     rng = np.random.default_rng(0)
-    return rng.normal(size=(_PROBES, n)), rng.normal(size=(_PROBES, m))
+    return 0.1 * rng.normal(size=(_PROBES, n)), rng.normal(size=(_PROBES, m))
 
 
 def _probe_points(model: Model) -> tuple[Array, Array, Array]:
     """Times, states and controls round the start; random, as a guess at rest would see no drag."""
     noise = _noise(model.state_dim, model.control_dim)
-    x = model.start + 0.1 * (1.0 + np.abs(model.start)) * noise[0]
+    x = model.start + (1.0 + abs(model.start)) * noise[0]
     return model.times[:_PROBES], x, noise[1]
 
 
@@ -377,13 +378,13 @@ def _called(model: Model, constraints: bool, t: Array, x: Array, u: Array) -> Ar
     problem: Any = model.problem
     moved = change(model.integrator, problem.drift, t, model.dt[0], x, u)
     values = [x + moved, problem.diffusion(t, x)]
-    values.append(problem.control_cost(t, x) if model.has("control_cost") else np.zeros_like(u))
+    values.append(problem.control_cost(t, x) if model.has("control_cost") else np.zeros(u.shape))
     for name in ("penalty", "constraint"):
         if _wanted(model, name, constraints):
             values.append(getattr(problem, name)(t, x))
-    values.append(problem.state_cost(t, x) if model.has("state_cost") else np.zeros_like(t))
+    values.append(problem.state_cost(t, x) if model.has("state_cost") else np.zeros(t.shape))
     values.append(problem.terminal(x))
-    rows = [np.asarray(value, dtype=np.float64).reshape(len(t), -1) for value in values]
+    rows = [np.asarray(value, np.float64).reshape(len(t), -1) for value in values]
     return np.concatenate(rows, axis=1)
 
 

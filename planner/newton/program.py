@@ -8,6 +8,7 @@ other.
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import functools
 import struct
@@ -61,6 +62,12 @@ class Program:
     recursions: Mapping[str, Recursion]
     code: machine_code.Code | None
     filled: Filled | None
+
+
+def called_with(function: Any, K: int, table: Array) -> Callable[[], None]:
+    """A kernel over K intervals on a table of addresses, which must live as long."""
+    # ctypes takes its own integers in half the time.
+    return functools.partial(function, ctypes.c_int64(K), ctypes.c_int64(table.ctypes.data))
 
 
 def compilable(dims: Dimensions) -> bool:
@@ -118,7 +125,9 @@ def _assembly(problem: Any, recursions: Mapping[str, Recursion], fields: Layout)
         from slipcar.planner.trace.graph import Graph
 
         return emit.module(list(recursions.values()), Graph(), fields, {})
+    n = problem.dims.n
     known = {name: getattr(problem, name) for name in ("A", "B", "C", "G")}
+    known["S"] = problem.lagrangian_hessian(problem.graph.inputs("lam", (n,)))[n:, :n]
     return emit.module(list(recursions.values()), problem.graph, fields, known)
 
 
@@ -164,7 +173,8 @@ class Probe:
             for name, field in self._layout.items()
         }
         table = [array.ctypes.data for array in self._arrays.values()]
-        self._table, self._count = np.array(table, dtype=np.int64), count
+        self._table = np.array(table, dtype=np.int64)
+        self._run = called_with(self._code.short["probe"], count, self._table)
         self._lock = threading.Lock()
 
     def __call__(self, t: Array, dt: float, x: Array, u: Array, number: Array) -> Array:
@@ -173,7 +183,7 @@ class Probe:
         with self._lock:
             arrays["t"][:, 0], arrays["dt"][:, 0] = t, dt
             arrays["x"][:], arrays["u"][:], arrays["number"][0] = x, u, number
-            self._code.short["probe"](self._count, self._table.ctypes.data)
+            self._run()
             return arrays["values"].copy()
 
 
@@ -206,6 +216,12 @@ class Workspace:
             for side in (0, 1)
         ]  # fmt: skip
         self._sides = swapped
+        self._numbers = {name: array.reshape(-1).data for name, array in self.arrays.items()}
+        self._views = [
+            {name: array.reshape(len(array), *program.layout[name].shape)
+             for name, array in side.items()}
+            for side in swapped
+        ]  # fmt: skip
         self._tables = [
             np.array([a.ctypes.data for a in side.values()], dtype=np.int64) for side in swapped
         ]
@@ -229,13 +245,11 @@ class Workspace:
 
     def view(self, name: str) -> Any:
         """The numbers of an array that has one row."""
-        return self.arrays[name].reshape(-1).data
+        return self._numbers[name]
 
     def at(self, side: int, name: str) -> Array:
         """What a kernel on that side calls `name`, (K + 1, ...) or (1, ...)."""
-        field = self.program.layout[name]
-        array = self._sides[side][name]
-        return array.reshape(len(array), *field.shape)
+        return self._views[side][name]
 
     def trajectory(self, flat: Array) -> tuple[Array, Array, Array]:
         """States (N, n), controls (K, m) and ν (q,) of a copy of one of the `trajectories`."""
@@ -264,7 +278,7 @@ class Workspace:
             recursion = program.recursions[name]
             return functools.partial(in_numpy, recursion, program.layout, self._sides[side], self.K)
         functions = program.code.short if brief(program.dims, self.K) else program.code.long
-        return functools.partial(functions[name], self.K, self._tables[side].ctypes.data)
+        return called_with(functions[name], self.K, self._tables[side])
 
 
 def _other(name: str, fields: Layout) -> str:

@@ -28,7 +28,8 @@ Array = np.ndarray
 #: Arrays that every run begins with at zero.
 _CLEARED = ("d", "e", "held", "P", "Sigma", "H_psd", "lam", "lam_new", "nu", "nu_new", "price", "reach", "law")
 _CLEARED_NOISY = ("gains", "eta", "offset", "s")
-_COUNTS = ("solver_iterations",)
+#: The equations of plans of the mean.
+_MEAN = Form()
 
 
 def load(workspace: Workspace, posed: Posed, weight: Array, x: Array, u: Array) -> None:
@@ -91,7 +92,7 @@ def solve_mean(
         ValueError: if a function of the problem is not finite along the guess.
     """
     model, w = posed.model, float(options.variance_weight)
-    workspace = borrow(posed.program(Form()), len(model.dt))
+    workspace = borrow(posed.program(_MEAN), len(model.dt))
     load(workspace, posed, model.weight, x, u)
     task = Task(
         tolerance=options.tolerance, max_iterations=options.max_iterations,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slipcar.planner.problem.numbers import finite
+from slipcar.planner.problem.numbers import finite, fits
 
 Array = np.ndarray
 _ARGUMENTS = {"drift": "t, x, u", "terminal": "x"}
@@ -82,9 +82,7 @@ def _shaped(label: str, value: Any, shape: tuple[int | None, ...], at_start: boo
     if at_start:
         return finite(f"{label} at the start", value, shape)
     array = np.asarray(value, dtype=np.float64)
-    if array.ndim != len(shape) or any(
-        want not in (None, size) for size, want in zip(array.shape, shape, strict=True)
-    ):
+    if not fits(array, shape):
         wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
         raise ValueError(
             f"{label} must have shape {wanted} for {shape[0]} points, not {array.shape}"

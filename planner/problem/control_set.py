@@ -65,7 +65,7 @@ def project_controls(u: Array, lower: Array, upper: Array, radius: float = np.in
     falls as ν grows: a bisection on 1 / (1 + ν) finds where it meets the radius.
     """
     inside = np.minimum(np.maximum(u, lower), upper)
-    if not np.isfinite(radius):
+    if radius == np.inf:
         return inside
     outside = np.linalg.norm(inside, axis=-1) > radius
     if not outside.any():

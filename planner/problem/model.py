@@ -266,7 +266,7 @@ def _signature(problem: Any) -> tuple[Any, ...]:
         value = getattr(problem, name, None)
         if value is not None:
             array = np.asarray(value)
-            value = (array.shape, array.dtype.str, array.tobytes())
+            value = (array.shape, array.dtype, array.tobytes())
         values.append(value)
     return (*values, *(getattr(problem, name, None) is None for name in _OPTIONAL))
 
@@ -298,28 +298,26 @@ def _checked(problem: Any) -> Model:
             getattr(problem, "start_covariance", None), len(start)
         ),
         times=times,
-        dt=np.diff(times),
+        dt=times[1:] - times[:-1],
         R=R,
         lower=lower,
         upper=upper,
         radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
-        weight=np.zeros(0),
+        weight=_checked_penalties(problem, times[:2], start, len(R)),
     )
-    model = dataclasses.replace(model, weight=_checked_penalties(model))
     for name in ("state_dim", "control_dim", "bounded", "R_inverse", "unit", "longest_dt"):
         getattr(model, name)  # once, for all copies of it
     return model
 
 
-def _checked_penalties(model: Model) -> Array:
+def _checked_penalties(problem: Any, t: Array, start: Array, m: int) -> Array:
     """The penalties' weights, (p,), after a look at every function at the start."""
-    x2, u2 = np.stack([model.start, model.start]), np.zeros((2, model.control_dim))
     names = ("drift", "diffusion", "terminal", "penalty", "state_cost", "control_cost")
-    given = answers(model.problem, model.times[:2], x2, u2, names=names, at_start=True)
+    x2, u2 = np.array([start, start]), np.zeros((2, m))
+    given = answers(problem, t, x2, u2, names=names, at_start=True)
     if "penalty" not in given:
         return np.zeros(0)
-    own: Any = model.problem
-    weight = finite("penalty_weight", own.penalty_weight, (given["penalty"].shape[1],))
+    weight = finite("penalty_weight", problem.penalty_weight, (given["penalty"].shape[1],))
     if (weight < 0).any():
         raise ValueError(f"penalty_weight must be >= 0, not {weight!r}")
     return weight

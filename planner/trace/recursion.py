@@ -85,6 +85,8 @@ def pack(carried: Carried) -> tuple[list[Any], Callable[[list[Any]], Carried]]:
 class SymbolRows:
     """Rows of a layout as symbols of a graph, of arrays in `known` as the constants they hold.
 
+    Arrays begin at zero: zeros that are known are not written.
+
     Attributes:
         writes: expressions by place and entry; the place of the next node's row ends in `AHEAD`.
     """
@@ -113,7 +115,9 @@ class SymbolRows:
             raise ValueError(f"{name} has rows of {field.width}, not {len(flat)}")
         place, row = name + self.AHEAD * ahead, np.empty(field.width, dtype=object)
         row[:] = list(map(self.graph.lift, flat))
-        self.writes.update({(place, i): entry for i, entry in enumerate(row)})
+        known = np.ravel(self._known.get(name, ()))
+        there = {i for i, entry in enumerate(known) if entry.is_zero and row[i].is_zero}
+        self.writes.update({(place, i): row[i] for i in range(len(row)) if i not in there})
         self._rows[place] = row.reshape(field.shape)  # what is written is read again
 
     ahead, write_ahead = partialmethod(__getitem__, ahead=True), partialmethod(write, ahead=True)
