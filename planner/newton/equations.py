@@ -73,8 +73,8 @@ class Evaluation(NamedTuple):
         running: Σ dt (H + ℓᵀu).
         charged: rows, noise and a soft end, spread and weights held.
         pull: Σ λᵀf + νᵀg.
-        gap: Σ_i max |λ_i| Σ |f_i|, in units of the cost; λ of the last step.
-        miss: Σ_j |ν_j g_j| of an exact end.
+        gap: Σ |λᵀf|.
+        miss: |νᵀg| of an exact end.
         defect: largest |f|.
         residual: largest |g| of an exact end.
         penalty: Σ dt Σ w max(0, c)² at the mean.
@@ -115,8 +115,8 @@ class Promise(NamedTuple):
         length: ∫ ΔuᵀRΔu dt.
         radius: ∫ ‖Δx‖² dt.
         pull: Σ λᵀf + νᵀg at the iterate.
-        gap: Σ_i max |λ_i| Σ |f_i| there.
-        miss: Σ_j |ν_j g_j| there.
+        gap: Σ |λᵀf| there.
+        miss: |νᵀg| there.
         changed: bounds that are passed and were not held, or the other way round.
         total: Σ λ: finite if all are.
     """
@@ -197,8 +197,8 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "evaluated": Field((len(Evaluation._fields),), True),
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
-        "verified": Field((len(Residuals._fields),), True), "price": Field((n,), True),
-        "reach": Field((q,), True), "late": Field(()), "stiff": Field((n,), True), "noise": Field((), True),
+        "verified": Field((len(Residuals._fields),), True),
+        "reach": Field((q,), True), "late": Field(()), "noise": Field((), True),
     }  # fmt: skip
     if form.noisy:
         fields |= {
@@ -254,12 +254,13 @@ class Equations:
         if p.state_cost:
             rows.write("H_xx", p.H_xx)
         row_cost, mean_cost = self._row_costs(rows, p.c)
+        charge = rows.ahead("lam").dot(f)
         sums = [
             effort + dt * u.dot(rows["R"].dot(u)),
             running + dt * p.ell.dot(u) + rows["dn"] * p.H,
             charged + row_cost + noise_charge(rows["P"], p.sigma, dt),
-            pull + rows.ahead("lam").dot(f),
-            gap + rows["price"].dot(magnitude(f)),
+            pull + charge,
+            gap + magnitude(charge),
             riccati.largest(f, defect),
             penalty + mean_cost,
         ]
@@ -279,7 +280,7 @@ class Equations:
             charged = charged + (rows["W"] * p.g).dot(p.g)
         else:
             pull = pull + rows["nu"].dot(p.g)
-            miss = magnitude(rows["nu"]).dot(magnitude(p.g))
+            miss = magnitude(rows["nu"].dot(p.g))
             residual = riccati.largest(p.g, 0.0)
         evaluation = Evaluation(
             effort=effort, running=running + rows["dn"] * p.H, charged=charged, pull=pull, gap=gap,
@@ -330,9 +331,7 @@ class Equations:
         return Q, q
 
     def _loaded(self, rows: Rows, Q: Array, q: Array, loss: Loss) -> tuple[Array, Array]:
-        """With the hinges that are on, where rows are certain, and the shift."""
-        shift = (2.0 * self._knob(rows, "damping") * rows["dn"]) * rows["stiff"]
-        Q = Q + np.eye(self.dims.n) * shift
+        """With the hinges that are on, where rows are certain."""
         if self.form.noisy:
             return Q, q
         return self._with_rows(Q, q, loss.scaled(self._knob(rows, "hinges")), rows["C"])
@@ -410,12 +409,11 @@ class Equations:
     # ------------------------------------------------------------------------------- forward
 
     def _forward_start(self, rows: Rows) -> Carried:
-        n = self.dims.n
-        return {"d": np.zeros(n), "price": np.zeros(n), "gap": np.zeros(n), "sums": np.zeros(8)}
+        return {"d": np.zeros(self.dims.n), "sums": np.zeros(9)}
 
     def _forward(self, rows: Rows, carried: Carried) -> Carried:
         d, u, f, dt = carried["d"], rows["u"], rows["f"], rows["dt"]
-        change, slope, step, length, radius, pull, changed, total = carried["sums"]
+        change, slope, step, length, radius, pull, gap, changed, total = carried["sums"]
         nu = rows["nu_new"][:0] if self.form.soft else rows["nu_new"]
         free = riccati.respond(rows["law"], d, nu)
         above, below = u + free - rows["upper"], rows["lower"] - u - free
@@ -428,6 +426,7 @@ class Equations:
         for name, value in (("d", d), ("e", inside), ("passed", passed)):
             rows.write(name, value)
         rows.write_ahead("lam_new", lam)
+        charge = lam.dot(f)
         control = rows["rk"] + 0.5 * rows["Rk"].dot(inside) + rows["S"].dot(d)
         sums = [
             change + self._node_change(rows, d) + control.dot(inside),
@@ -435,25 +434,24 @@ class Equations:
             step + dt * inside.dot(inside),
             length + dt * inside.dot(rows["R"].dot(inside)),
             radius + rows["dn"] * d.dot(d),
-            pull + lam.dot(f),
+            pull + charge,
+            gap + magnitude(charge),
             changed + np.sum(magnitude(passed - rows["held"])),
             total + np.sum(lam),
         ]
-        price, gap = larger(magnitude(lam), carried["price"]), carried["gap"] + magnitude(f)
-        return {"d": ahead, "price": price, "gap": gap, "sums": np.array(sums)}
+        return {"d": ahead, "sums": np.array(sums)}
 
     def _forward_end(self, rows: Rows, carried: Carried) -> None:
-        d, g, price = carried["d"], rows["g"], carried["price"]
-        change, slope, step, length, radius, pull, changed, total = carried["sums"]
+        d, g = carried["d"], rows["g"]
+        change, slope, step, length, radius, pull, gap, changed, total = carried["sums"]
         rows.write("d", d)
-        rows.write("price", price)
         miss: Any = 0.0
         if not self.form.soft:
             pull = pull + rows["nu_new"].dot(g)
-            miss = magnitude(rows["nu_new"]).dot(magnitude(g))
+            miss = magnitude(rows["nu_new"].dot(g))
         promise = Promise(
             change + self._node_change(rows, d), slope + self._node_slope(rows, d), step, length, radius + rows["dn"] * d.dot(d),
-            pull, price.dot(carried["gap"]), miss, changed, total,
+            pull, gap, miss, changed, total,
         )  # fmt: skip
         rows.write("promised", np.array(promise, dtype=object))
 

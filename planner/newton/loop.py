@@ -26,8 +26,9 @@ After each step the belief follows: covariance, rows' spread, weights P and gain
 (:mod:`slipcar.planner.moments.propagation`). Its fixed points are stationary points of the expected
 cost in controls and gains, but for how ∂b/∂x, σ′, C and ½ tr(∂²c Σ) follow.
 
-The merit function is Φ = cost + Σ λᵀf + νᵀg + s (½ max|λ| ‖f‖₁ + ½ max|ν| ‖g‖₁), f the defects of
-the dynamics and g the terminal condition, with s ≥ 1 large enough that the step descends.
+The merit function is Φ = cost + Σ λᵀf + νᵀg + s (½ Σ |λᵀf| + ½ |νᵀg|), f the defects of the
+dynamics and g the terminal condition, with s ≥ 1 large enough that the step descends. Nothing in it
+depends on the units or the axes of states and controls.
 """
 
 from __future__ import annotations
@@ -181,17 +182,18 @@ class Iteration:
         self.side, self.shift, self.floor = 0, 0.0, 0.0
         self.renewal = tuning.renewal
         self.shortest, self.stale, self.rejected, self.tried = math.inf, 0, 0, 0
-        self.hopeless, self.curvature, self.measured, self.bold = 0, 1.0, False, tuning.free_steps > 0
+        self.hopeless, self.curvature, self.bold = 0, 1.0, tuning.free_steps > 0
         self._bent = False
 
     def run(self) -> Ending:
         """Iterate."""
         ws, task, tuning = self.workspace, self.task, self.tuning
-        ws.arrays["knob"][0] = [{
+        given = {
             "hinges": 1.0, "variance_weight": task.variance_weight,
             "closed": 1.0 if task.feedback else 0.0, "saturation": task.saturation,
             "stiffness": tuning.bound_stiffness, "softness": SOFTNESS,
-        }.get(name, 0.0) for name in KNOBS]  # fmt: skip
+        }  # fmt: skip
+        ws.arrays["knob"][0] = [given.get(name, 0.0) for name in KNOBS]
         self.at = self._evaluated(0)
         if not math.isfinite(sum(self.at)):
             return Ending(None, 0, 0, self.at)
@@ -223,8 +225,6 @@ class Iteration:
             )
             fallback = tuning.falls_back and self.rejected >= tuning.rejections
             curved = newton and not fallback
-            if newton and not self.measured:
-                self._measure()
             if self.noisy and task.bounded:
                 self._confine()
             self._prepare(curved)
@@ -263,14 +263,6 @@ class Iteration:
         self._evaluate[side]()
         evaluation: Evaluation = self.workspace.evaluation()
         return evaluation
-
-    def _measure(self) -> None:
-        """What a state's shift is worth: as much as the effort where it moves by its size."""
-        ws, self.measured = self.workspace, True
-        t = ws.arrays["t"]
-        rate = self.at.effort / (t[-1, 0] - t[0, 0])
-        moved = np.ptp(ws.at(self.side, "x"), axis=0)
-        ws.arrays["stiff"][0] = np.divide(self.tuning.statewise * rate, moved * moved, out=np.zeros_like(moved), where=moved > 0.0)
 
     def _roll_out(self, side: int) -> None:
         """The candidate on that side follows its dynamics and the step's law."""

@@ -65,7 +65,6 @@ class Tuning(NamedTuple):
     noise: float = 1e-9
     careful: float = 0.3
     boldness: float = 2.0
-    statewise: float = 1.0
     largest_shift: float = 0.5
     least_curvature: float = 0.05
     bent: float = 0.5
