@@ -197,7 +197,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "evaluated": Field((len(Evaluation._fields),), True),
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
-        "verified": Field((len(Residuals._fields),), True),
+        "verified": Field((len(Residuals._fields),), True), "price": Field((n, n), True), "priced": Field((n, n), True),
         "reach": Field((q,), True), "late": Field(()), "noise": Field((), True),
     }  # fmt: skip
     if form.noisy:
@@ -260,7 +260,7 @@ class Equations:
             running + dt * p.ell.dot(u) + rows["dn"] * p.H,
             charged + row_cost + noise_charge(rows["P"], p.sigma, dt),
             pull + charge,
-            gap + magnitude(charge),
+            gap + self._detour(rows, f),
             riccati.largest(f, defect),
             penalty + mean_cost,
         ]
@@ -280,13 +280,17 @@ class Equations:
             charged = charged + (rows["W"] * p.g).dot(p.g)
         else:
             pull = pull + rows["nu"].dot(p.g)
-            miss = magnitude(rows["nu"].dot(p.g))
+            miss = magnitude(rows["nu"]).dot(magnitude(p.g))
             residual = riccati.largest(p.g, 0.0)
         evaluation = Evaluation(
             effort=effort, running=running + rows["dn"] * p.H, charged=charged, pull=pull, gap=gap,
             miss=miss, defect=defect, residual=residual, penalty=penalty + mean_cost,
         )  # fmt: skip
         rows.write("evaluated", np.array(evaluation, dtype=object))
+
+    def _detour(self, rows: Rows, f: Array) -> Any:
+        """What a defect f (n,) costs: the root mean square of λᵀf over the λ of the last step."""
+        return np.sqrt(positive_part(f.dot(rows["price"].dot(f))))
 
     def _row_costs(self, rows: Rows, c: Array) -> tuple[Any, Any]:
         """What rows c (p,) are charged here, and what the penalties would be were they certain."""
@@ -337,6 +341,7 @@ class Equations:
         return self._with_rows(Q, q, loss.scaled(self._knob(rows, "hinges")), rows["C"])
 
     def _last(self, rows: Rows) -> Carried:
+        rows.write("price", rows["priced"])
         p, nu = self.problem.at(rows), rows["nu"]
         g, G = rows["g"], rows["G"]
         Q, q, loss = self._node_model(rows)
@@ -409,11 +414,14 @@ class Equations:
     # ------------------------------------------------------------------------------- forward
 
     def _forward_start(self, rows: Rows) -> Carried:
-        return {"d": np.zeros(self.dims.n), "sums": np.zeros(9)}
+        n = self.dims.n
+        return {
+            "d": np.zeros(n), "prices": Symmetric(np.zeros((n, n))), "sums": np.zeros(10),
+        }  # fmt: skip
 
     def _forward(self, rows: Rows, carried: Carried) -> Carried:
         d, u, f, dt = carried["d"], rows["u"], rows["f"], rows["dt"]
-        change, slope, step, length, radius, pull, gap, changed, total = carried["sums"]
+        change, slope, step, length, radius, pull, gap, changed, total, time = carried["sums"]
         nu = rows["nu_new"][:0] if self.form.soft else rows["nu_new"]
         free = riccati.respond(rows["law"], d, nu)
         above, below = u + free - rows["upper"], rows["lower"] - u - free
@@ -435,20 +443,23 @@ class Equations:
             length + dt * inside.dot(rows["R"].dot(inside)),
             radius + rows["dn"] * d.dot(d),
             pull + charge,
-            gap + magnitude(charge),
+            gap + self._detour(rows, f),
             changed + np.sum(magnitude(passed - rows["held"])),
             total + np.sum(lam),
+            time + dt,
         ]
-        return {"d": ahead, "sums": np.array(sums)}
+        prices = carried["prices"] + dt * np.multiply.outer(lam, lam)
+        return {"d": ahead, "prices": Symmetric(prices), "sums": np.array(sums)}
 
     def _forward_end(self, rows: Rows, carried: Carried) -> None:
         d, g = carried["d"], rows["g"]
-        change, slope, step, length, radius, pull, gap, changed, total = carried["sums"]
+        change, slope, step, length, radius, pull, gap, changed, total, time = carried["sums"]
         rows.write("d", d)
+        rows.write("priced", carried["prices"] / time)
         miss: Any = 0.0
         if not self.form.soft:
             pull = pull + rows["nu_new"].dot(g)
-            miss = magnitude(rows["nu_new"].dot(g))
+            miss = magnitude(rows["nu_new"]).dot(magnitude(g))
         promise = Promise(
             change + self._node_change(rows, d), slope + self._node_slope(rows, d), step, length, radius + rows["dn"] * d.dot(d),
             pull, gap, miss, changed, total,
