@@ -260,7 +260,7 @@ class Equations:
             running + dt * p.ell.dot(u) + rows["dn"] * p.H,
             charged + row_cost + noise_charge(rows["P"], p.sigma, dt),
             pull + charge,
-            gap + self._detour(rows, f),
+            gap + self._detour(rows, f) + magnitude(charge),
             riccati.largest(f, defect),
             penalty + mean_cost,
         ]
@@ -443,7 +443,7 @@ class Equations:
             length + dt * inside.dot(rows["R"].dot(inside)),
             radius + rows["dn"] * d.dot(d),
             pull + charge,
-            gap + self._detour(rows, f),
+            gap + self._detour(rows, f) + magnitude(charge),
             changed + np.sum(magnitude(passed - rows["held"])),
             total + np.sum(lam),
             time + dt,

@@ -199,6 +199,7 @@ class Iteration:
             return Ending(None, 0, 0, self.at)
         self._believe(fresh=not task.warm)
         self._backward[0]()  # with kappa zero: how far the last controls move the end
+        self._forward[0]()  # and what defects cost
         self._knobs[_KAPPA] = tuning.terminal_curvature
         self._first_effort = self.at.effort
         status = self._iterate()
@@ -379,7 +380,7 @@ class Iteration:
     def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
         model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
-        lacking = 0.5 * (promise.gap + promise.miss)
+        lacking = 1.0 * (promise.gap + promise.miss)
         descent = promise.pull - promise.slope
         factor = max(1.0, -descent / (0.75 * lacking)) if lacking > 0.0 else 1.0
         descent += factor * lacking
@@ -401,7 +402,7 @@ class Iteration:
                 self._shift[self.side]()
             new = self._evaluated(there)
             merit = new.effort + new.running + new.charged + new.pull
-            merit += factor * 0.5 * (new.gap + new.miss)
+            merit += factor * 1.0 * (new.gap + new.miss)
             actual = before - merit
             accepted = math.isfinite(merit) and (
                 (not newton and actual >= -tuning.boldness * (descent + size - abs(promise.pull)))
