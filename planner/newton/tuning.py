@@ -43,7 +43,7 @@ class Tuning(NamedTuple):
 
     free_steps: int = 20
     released_steps: int = 10
-    released: float = 0.02
+    released: float = 0.005
     settled: float = 1.0
     bound_rounds: int = 6
     bound_stiffness: float = 1e12
@@ -65,7 +65,7 @@ class Tuning(NamedTuple):
     noise: float = 1e-9
     careful: float = 0.3
     boldness: float = 2.0
-    largest_shift: float = 0.5
+    largest_shift: float = 2.0
     least_curvature: float = 0.05
     bent: float = 0.5
     defective: float = 0.1
