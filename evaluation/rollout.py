@@ -19,7 +19,7 @@ import numpy as np
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.integrate import added_up
-from slipcar.envs.options import check_slots
+from slipcar.envs.options import check_seen
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.validate import checked_int
@@ -208,7 +208,7 @@ def play(
     hidden: list[Any] = [None] * len(chunks)
     starts = np.ones(chunk, dtype=bool)
     layout = observation_layout(controller)
-    check_slots(layout, scenario)
+    check_seen(layout, scenario)
     x = block_starts(seed, block, scenario)[:rows]
     noise = block_noise(seed, block, scenario, substeps)
     for k, variates in enumerate(noise):
