@@ -25,7 +25,10 @@ def write_atomically(path: Path, content: bytes) -> None:
     try:
         temporary.write_bytes(content)
         os.replace(temporary, path)
-    except OSError as error:  # it would name the temporary file, which nobody asked for
+    except OSError as error:
+        if error.filename is None:
+            raise
+        # It names the temporary file, which nobody asked for.
         raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):

@@ -61,8 +61,11 @@ def write(plan: Any, path: str | os.PathLike[str]) -> Path:
     try:
         np.savez_compressed(temporary, allow_pickle=False, **arrays)
         os.replace(temporary, path)
-    except OSError as error:  # it would name the temporary file, which nobody asked for
-        raise type(error)(error.errno, error.strerror or str(error), str(path)) from error
+    except OSError as error:
+        if error.filename is None:
+            raise
+        # It names the temporary file, which nobody asked for.
+        raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
