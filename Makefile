@@ -34,7 +34,7 @@ CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
 
-.PHONY: help install compare suites frontier reproduce report kills test test-long train bench bench-worlds bench-docs lint types lock peers clean
+.PHONY: help install compare suites frontier reproduce report kills matrix test test-long train bench bench-worlds bench-docs lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -60,6 +60,11 @@ report: $(INSTALLED)  ## one page of everything in results/: results/report.html
 
 kills: $(INSTALLED)  ## kill a comparison 20 times at random moments: is anything lost?
 	$(BIN)/python benchmarks/kills.py $(ARGS)
+
+# Environments of its own, with PyPI, apart from .venv. torch for Python 3.11 alone: elsewhere pip
+# would take a build of gigabytes.
+matrix:  ## oldest and newest versions of every dependency, Python 3.11 to 3.14 where they are
+	SDL_VIDEODRIVER=dummy $(PYTHON) benchmarks/matrix.py --torch $(TORCH) $(ARGS)
 
 test: $(INSTALLED)  ## all tests but the long ones
 	$(BIN)/python -m pytest -n $(TESTERS) $(ARGS)
@@ -90,7 +95,7 @@ types: $(INSTALLED)  ## mypy over the installed package
 	$(BIN)/mypy
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare suites frontier reproduce kills train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
+compare suites frontier reproduce kills matrix train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
 
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

@@ -13,7 +13,7 @@ from slipcar.baselines.cloning_config import CloneConfig
 from slipcar.baselines.demonstrations import Demonstrations, demonstrate
 from slipcar.baselines.network import make_network, policy_of
 from slipcar.baselines.policy import Policy
-from slipcar.baselines.session import single_thread
+from slipcar.baselines.session import training_session
 from slipcar.baselines.watch import Watch
 from slipcar.envs.observation import Layout
 from slipcar.envs.sources import Source
@@ -21,7 +21,7 @@ from slipcar.envs.sources import Source
 
 def train(source: Source, layout: Layout, config: CloneConfig, seed: int) -> Policy:
     """See :func:`slipcar.baselines.clone_planner`, which checks the arguments."""
-    with single_thread():
+    with training_session():
         watch = Watch(source, config.validation_episodes)
         examples = demonstrate(
             source, layout, worlds=config.worlds, episodes=config.episodes,

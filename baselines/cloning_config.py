@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from slipcar.baselines.config import check_number, check_widths, is_count
+from slipcar.baselines.config import check_number, check_widths, is_count, plain_numbers
 from slipcar.envs import Family
 from slipcar.envs.observation import Layout
 from slipcar.envs.sources import Source
@@ -44,7 +44,7 @@ class CloneConfig:
     obstacle_slots: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
+        plain_numbers(self)
         for name in ("worlds", "episodes", "epochs", "batch", "validation_episodes"):
             check_number(name, getattr(self, name), is_count, "an integer >= 1")
         check_number("learning_rate", self.learning_rate, lambda x: x > 0.0, "finite and > 0")

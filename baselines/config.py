@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from slipcar.envs import Family
 from slipcar.envs.observation import Layout
 from slipcar.envs.sources import Source
@@ -74,7 +76,7 @@ class PPOConfig:
     goal_share: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
+        plain_numbers(self)
         counts = (
             "total_steps", "environments", "minibatches", "epochs", "evaluate_every",
             "validation_episodes", "checkpoint_every",
@@ -122,6 +124,21 @@ FAMILY: dict[str, Any] = {
     "evaluate_every": 10,
     "validation_episodes": 2048,
 }
+
+
+def plain_numbers(config: Any) -> None:
+    """Make NumPy's scalars in a configuration Python's numbers, which its files can hold."""
+    object.__setattr__(config, "hidden", tuple(config.hidden))
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, tuple):
+            object.__setattr__(config, field.name, tuple(map(_plain, value)))
+        else:
+            object.__setattr__(config, field.name, _plain(value))
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def is_count(value: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import re
@@ -14,6 +15,9 @@ def write_atomically(path: Path, content: bytes) -> None:
     Args:
         path: the file; its folder is made if it is missing.
         content: the whole of it.
+
+    Raises:
+        OSError: if it cannot be written, naming `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     # Host and process keep two runs that write the same file from sharing a temporary one.
@@ -21,8 +25,14 @@ def write_atomically(path: Path, content: bytes) -> None:
     try:
         temporary.write_bytes(content)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        # It names the temporary file, which nobody asked for.
+        raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> None:

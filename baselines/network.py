@@ -27,7 +27,7 @@ def make_network(sizes: Sequence[int], generator: torch.Generator) -> torch.nn.S
     layers: list[torch.nn.Module] = []
     last = len(sizes) - 2
     for i, (width, out) in enumerate(itertools.pairwise(sizes)):
-        linear = torch.nn.Linear(width, out)
+        linear = torch.nn.Linear(width, out, dtype=torch.float32)
         gain = 0.01 if i == last else 2.0**0.5
         torch.nn.init.orthogonal_(linear.weight, gain, generator=generator)
         torch.nn.init.zeros_(linear.bias)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from slipcar.baselines.config import check_number, check_widths, is_count
+from slipcar.baselines.config import check_number, check_widths, is_count, plain_numbers
 from slipcar.envs import Family
 from slipcar.envs.observation import Layout
 from slipcar.envs.sources import Source
@@ -48,7 +48,7 @@ class PathwiseConfig:
     goal_share: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
+        plain_numbers(self)
         for name in ("iterations", "paths", "warm_up", "evaluate_every", "validation_episodes"):
             check_number(name, getattr(self, name), is_count, "an integer >= 1")
         for name in ("learning_rate", "max_gradient_norm"):

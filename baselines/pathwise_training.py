@@ -15,7 +15,7 @@ from slipcar.baselines.network import copy_into, make_network, policy_of
 from slipcar.baselines.pathwise_config import PathwiseConfig
 from slipcar.baselines.policy import ACTION_DIM, Policy
 from slipcar.baselines.progress import Progress
-from slipcar.baselines.session import bar_for, single_thread
+from slipcar.baselines.session import bar_for, training_session
 from slipcar.baselines.storage import save_policy
 from slipcar.baselines.watch import Watch
 from slipcar.envs.arrays import tensor_functions
@@ -78,7 +78,7 @@ def train(
     generator = torch.Generator().manual_seed(int(for_torch.generate_state(1)[0]))
     shape = (base.nodes - 1, 1, base.noise_dim, config.paths)
     steps, total = config.paths * (base.nodes - 1), config.iterations
-    with single_thread(), bar_for("pathwise gradients", total * steps, progress) as bar:
+    with training_session(), bar_for("pathwise gradients", total * steps, progress) as bar:
         network = make_network((layout.size, *config.hidden, ACTION_DIM), generator)
         before = 0
         if initial is not None:

@@ -4,8 +4,8 @@ The two conventions differ in three ways, and this adapter is the translation:
 
 * SB3 resets finished episodes inside `step` and hands the last observation over in
   `info["terminal_observation"]`: our SAME_STEP autoreset, `final_obs`.
-* SB3 asks for `info["TimeLimit.truncated"]`; it is always False here, because the horizon
-  belongs to the problem (SPEC §5: bootstrapping there makes learning fail).
+* SB3 asks for `info["TimeLimit.truncated"]`: False at the horizon, which belongs to the problem
+  (bootstrapping there makes learning fail), True where `max_episode_steps` cut an episode off.
 * SB3 wants one dictionary per sub-environment. Only those of finished episodes are filled,
   with the `"episode"` entry its Monitor would write, so no Python loop runs over
   sub-environments in mid-episode.
@@ -97,7 +97,8 @@ class SB3VecEnv(VecEnv):
         Raises:
             ValueError: for misshapen or non-finite actions.
         """
-        observation, reward, done, _, info = self.env.step(self._actions)
+        observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        done = terminated | truncated
         # Where an episode ended, `info` tells of the new one and `final_info` of the old.
         last = info.get("final_info")
         for row, name in zip(self._totals[1:], _SUMMED, strict=True):
@@ -108,6 +109,7 @@ class SB3VecEnv(VecEnv):
         if last is not None:
             for i in np.flatnonzero(done):
                 infos[i] = self._end_of_episode(int(i), info["final_obs"][i], last)
+                infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             self._totals[:, done] = 0.0
             self._lengths[done] = 0
         return observation, (reward * self.reward_scale).astype(np.float32), done, infos
@@ -119,7 +121,6 @@ class SB3VecEnv(VecEnv):
         seconds = round(time.perf_counter() - self._began, 6)
         return {
             "terminal_observation": observation,
-            "TimeLimit.truncated": False,
             "episode": {"r": total, "l": int(self._lengths[i]), "t": seconds},
             **dict(zip(_SUMMED, sums, strict=True)),
             "goal": float(last["goal"][i]),

@@ -70,8 +70,8 @@ def score(
     Raises:
         ValueError: for a bad argument.
     """
-    checked_int("episodes", episodes, at_least=1)
-    checked_int("seed", seed, at_least=0)
+    episodes = checked_int("episodes", episodes, at_least=1)
+    seed = checked_int("seed", seed, at_least=0)
     kind = getattr(controller, "observation", "features")
     slots = getattr(controller, "obstacle_slots", 0)
     several = isinstance(scenario, Sequence) and not isinstance(scenario, str)

@@ -1,4 +1,4 @@
-"""What every training session needs around it: one thread, its own random states, a bar."""
+"""What every training session needs: one thread, float32, its own random states, a bar."""
 
 from __future__ import annotations
 
@@ -35,18 +35,21 @@ def bar_for(name: str, total: int, shown: bool, done: int = 0) -> Any:
 
 
 @contextlib.contextmanager
-def single_thread() -> Iterator[None]:
+def training_session() -> Iterator[None]:
     """One torch thread, since more slow so small a network down; put back afterwards.
 
-    So are the global random states of Python, NumPy and torch, which training seeds.
+    So are the global random states of Python, NumPy and torch, which training seeds, and torch's
+    default dtype: networks are float32, as what they are shown, whatever the caller's default is.
     """
-    threads = torch.get_num_threads()
+    threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
     states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
     torch.set_num_threads(1)
+    torch.set_default_dtype(torch.float32)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+        torch.set_default_dtype(dtype)
         random.setstate(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         torch.set_rng_state(states[2])

@@ -20,7 +20,7 @@ from slipcar.baselines.learner import (
 from slipcar.baselines.policy import Policy
 from slipcar.baselines.progress import Progress
 from slipcar.baselines.score import Score
-from slipcar.baselines.session import bar_for, single_thread
+from slipcar.baselines.session import bar_for, training_session
 from slipcar.baselines.storage import policy_from_tensors, policy_tensors, save_policy
 from slipcar.baselines.watch import Candidate, Watch
 from slipcar.envs.sources import Source, base_of
@@ -51,7 +51,7 @@ def train(
         progress: whether to show a bar.
         callback: the caller's, or None.
     """
-    with single_thread():
+    with training_session():
         session = Session(make_learner(source, config, seed), source, config, folder)
         if initial is not None:
             session.count(initial)

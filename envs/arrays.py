@@ -27,7 +27,6 @@ class Functions(NamedTuple):
         sqrt: square root.
         positive: max(0, ·).
         clip: (value, low, high), the value limited to a range of floats.
-        bounded: (values, limit), a sequence of components, each limited to ± limit.
         total: sum of an array along its first axis.
         smallest: minimum of an array along its first axis.
     """
@@ -37,7 +36,6 @@ class Functions(NamedTuple):
     sqrt: Any
     positive: Any
     clip: Any
-    bounded: Any
     total: Any
     smallest: Any
 
@@ -68,27 +66,12 @@ def _clip_array(value: Any, low: float, high: float) -> Any:
     return np.minimum(limited, _constant(value.shape, value.dtype, high), out=limited)
 
 
-def _bounded_floats(values: Sequence[float], limit: float) -> list[float]:
-    return [_clip_float(value, -limit, limit) for value in values]
-
-
-def _bounded_arrays(values: Any, limit: float) -> Any:
-    # Hardly ever is anything beyond: to look costs a third of clipping.
-    if isinstance(values, np.ndarray) and values.max() <= limit and values.min() >= -limit:
-        return values
-    return [_clip_array(value, -limit, limit) for value in values]
-
-
 _total = functools.partial(np.add.reduce, axis=0)
 _smallest = functools.partial(np.minimum.reduce, axis=0)
 #: For one car. Python's floats are ten times faster than NumPy's scalars.
-FLOATS = Functions(
-    math.cos, math.sin, math.sqrt, _positive_float, _clip_float, _bounded_floats, sum, min
-)
+FLOATS = Functions(math.cos, math.sin, math.sqrt, _positive_float, _clip_float, sum, min)
 #: For arrays, one element per car.
-ARRAYS = Functions(
-    np.cos, np.sin, np.sqrt, _positive_array, _clip_array, _bounded_arrays, _total, _smallest
-)
+ARRAYS = Functions(np.cos, np.sin, np.sqrt, _positive_array, _clip_array, _total, _smallest)
 
 
 def functions_of(component: Any) -> Functions:
@@ -110,7 +93,6 @@ def functions_of(component: Any) -> Functions:
         sqrt=xp.sqrt,
         positive=lambda value: xp.clip(value, min=0.0),
         clip=xp.clip,
-        bounded=lambda values, limit: [xp.clip(value, -limit, limit) for value in values],
         total=lambda values: xp.sum(values, axis=0),
         smallest=lambda values: xp.min(values, axis=0),
     )
@@ -127,16 +109,9 @@ def tensor_functions() -> Functions:
         torch.sqrt,
         torch.relu,
         torch.clamp,
-        _bounded_tensors,
         functools.partial(torch.sum, dim=0),
         functools.partial(torch.amin, dim=0),
     )
-
-
-def _bounded_tensors(values: Any, limit: float) -> list[Any]:
-    import torch
-
-    return [torch.clamp(value, -limit, limit) for value in values]
 
 
 def array_namespace(*arrays: Any) -> Any:

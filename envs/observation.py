@@ -22,7 +22,13 @@ and what else differs from world to world):
 
 With `slots=k` the k nearest obstacles follow, nearest rim first, four numbers each: centre −
 position (in the car's frame for `egocentric`) [m], radius [m], and 1 as a mask; four zeros where
-there are fewer. All is float32 with finite bounds so wide that no physical path meets them.
+there are fewer.
+
+All is float32. Only the rates, entries 7:12, are clipped, and neither time nor state is decoded
+from them: positions, speeds and headings are unbounded (`Box(-inf, inf)`, as Gymnasium's own
+environments declare what has no limit), so that a controller sees where it is however large the
+world. A `state` resolves a position to 6e-8 of its distance from the origin, 1 mm at 10 km; the
+other kinds, which are relative to the goal, to 6e-8 of its distance from there.
 """
 
 from __future__ import annotations
@@ -62,7 +68,6 @@ SLOT = ("x", "y", "radius", "present")
 _POSITION_SCALE = 1.0
 _TIME_SCALE, _SLIP_SCALE = 5.0, (0.1, 0.01)
 _RATE_LIMIT = 5.0
-_WIDE = 1000.0
 
 
 def check_kind(kind: str) -> str:
@@ -125,7 +130,7 @@ class Layout:
 
     def space(self, horizon: float) -> Box:
         """Bounds of one observation in worlds of at most this horizon [s]."""
-        high = np.full(self.size, _WIDE)
+        high = np.full(self.size, np.inf)
         low = -high
         if self.kind == "state":
             low[5], high[5] = 0.0, horizon
@@ -158,10 +163,9 @@ def entries(
         The entries, and, for NumPy arrays, a block (cars, m) of those that follow; what is missing
         at the end is zero.
     """
-    clip = functions.clip
     if layout.kind == "state":
         shown, block = _obstacles(layout, p, x, rims, functions, None)
-        return [*functions.bounded(x, _WIDE), t, *shown], block
+        return [*x, t, *shown], block
     theta, v, omega = x[2], x[3], x[4]
     dx, dy, turn = p.goal[0] - x[0], p.goal[1] - x[1], p.goal[2] - theta
     cos, sin = functions.cos(theta), functions.sin(theta)
@@ -170,25 +174,25 @@ def entries(
         frame = (cos, sin)
         dx, dy = _turned(frame, dx, dy)
         cos, sin = functions.cos(turn), functions.sin(turn)
-    # Never below one step: on the last observation there is nothing left to divide by.
     to_go = p.horizon - t
-    rate = 1.0 / (max(to_go, p.dt) if isinstance(to_go, float) else _at_least(to_go, p.dt))
+    # Never below one step: on the last observation there is nothing left to divide by.
+    rate = 1.0 / _at_least(to_go, p.dt)
     # The last node's time may be rounded to a little after the horizon.
     fraction = _limited(2.0 * t / p.horizon - 1.0, -1.0, 1.0)
     seen = [
-        *functions.bounded([dx / _POSITION_SCALE, dy / _POSITION_SCALE], _WIDE),
+        dx / _POSITION_SCALE,
+        dy / _POSITION_SCALE,
         cos,
         sin,
-        *functions.bounded(x[3:5], _WIDE),
+        v,
+        omega,
         fraction,
-        *(clip(e * rate, -_RATE_LIMIT, _RATE_LIMIT) for e in (dx, dy, turn, v, omega)),
+        *(functions.clip(e * rate, -_RATE_LIMIT, _RATE_LIMIT) for e in (dx, dy, turn, v, omega)),
     ]
     if layout.kind == "egocentric":
-        rest = (
-            to_go / _TIME_SCALE,
-            *(s / scale for s, scale in zip(p.slip, _SLIP_SCALE, strict=True)),
-        )
-        seen += [_limited(value, 0.0, _WIDE) for value in rest]
+        # The last node's time may be rounded to a little after the horizon.
+        seen.append(_at_least(to_go, 0.0) / _TIME_SCALE)
+        seen += [s / scale for s, scale in zip(p.slip, _SLIP_SCALE, strict=True)]
     shown, block = _obstacles(layout, p, x, rims, functions, frame)
     return seen + shown, block
 
@@ -293,7 +297,7 @@ def _seen(row: Any, x: Any, frame: Any, functions: Functions) -> list[Any]:
     dx, dy = present * (row[0] - x[0]), present * (row[1] - x[1])
     if frame is not None:
         dx, dy = _turned(frame, dx, dy)
-    return [*functions.bounded([dx, dy], _WIDE), radius, present]
+    return [dx, dy, radius, present]
 
 
 def _turned(frame: tuple[Any, Any], dx: Any, dy: Any) -> tuple[Any, Any]:
@@ -308,6 +312,8 @@ def _limited(value: Any, low: float, high: float) -> Any:
 
 
 def _at_least(values: Any, low: Any) -> Any:
+    if isinstance(values, float):
+        return max(values, low)
     if isinstance(values, np.ndarray):
         return np.maximum(values, low)
     xp = array_namespace(values)

@@ -15,7 +15,7 @@ from slipcar.envs.validate import checked_array
 
 RENDER_MODES = ("rgb_array", "human")
 DTYPES = ("float32", "float64")
-_FARTHEST = 1e6  # beyond it a float32 cannot tell centimetres, nor an angle its direction
+_FARTHEST = 1e6  # beyond it a float32 cannot tell decimetres, nor an angle its direction
 
 
 def check_render_mode(mode: str | None) -> str | None:
@@ -86,18 +86,30 @@ def layout_for(source: Source, kind: str, slots: int | None) -> Layout:
     if slots is None:
         slots = most_obstacles(source) if isinstance(source, Family) else 0
     layout = Layout(kind, slots)
-    check_slots(layout, source)
+    check_seen(layout, source)
     return layout
 
 
-def check_slots(layout: Layout, source: Source) -> None:
-    """Raises ValueError if a world may have more obstacles than an observation with slots shows."""
+def check_seen(layout: Layout, source: Source) -> None:
+    """Check that observations say what they are for.
+
+    Raises:
+        ValueError: if a world may have more obstacles than an observation with slots shows, or is
+            so far from the origin that a float32 `state` does not tell where the car is.
+    """
     most = most_obstacles(source)
     if 0 < layout.slots < most:
         raise ValueError(
             f"the {_name(source)} has up to {most} obstacles and the observation shows "
             f"{layout.slots}: pass obstacle_slots={most} or more when the environment is made, "
             "or 0 to show none"
+        )
+    ends = np.stack([base_of(source).start, base_of(source).goal])
+    if layout.kind == "state" and np.abs(ends).max() > _FARTHEST:
+        raise ValueError(
+            f"the {_name(source)} leads from {ends[0].tolist()} to {ends[1].tolist()}, and the "
+            f"float32 of a state observation tells too little beyond ±{_FARTHEST:g}: move the "
+            "world to the origin, or take the observation 'features', relative to the goal"
         )
 
 
@@ -108,7 +120,7 @@ def check_source(layout: Layout, space: Any, source: Source) -> None:
         ValueError: if they have more obstacles than slots, a longer horizon than the observation
             space allows for, or no control bounds.
     """
-    check_slots(layout, source)
+    check_seen(layout, source)
     horizon = longest_horizon(source)
     if layout.kind == "state" and horizon > space.high[5]:
         raise ValueError(

@@ -22,7 +22,14 @@ from slipcar.envs import car, cost, routes, worlds
 from slipcar.envs import observation as layouts
 from slipcar.envs.arrays import array_namespace
 from slipcar.envs.parameters import Parameters
-from slipcar.envs.validate import checked_array, checked_float, checked_int, parsed_object, replaced
+from slipcar.envs.validate import (
+    MARK,
+    checked_array,
+    checked_float,
+    checked_int,
+    parsed_object,
+    replaced,
+)
 
 _FORMAT = 1
 
@@ -237,7 +244,7 @@ class Scenario:
         if isinstance(scenario, Scenario):
             return scenario
         if isinstance(scenario, str):
-            text = scenario.lstrip()
+            text = scenario.removeprefix(MARK).lstrip()
             return cls.from_json(text) if text.startswith("{") else cls.named(scenario)
         if isinstance(scenario, Mapping):
             return cls.from_dict(scenario)

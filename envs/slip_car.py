@@ -28,6 +28,7 @@ from slipcar.envs.overlay import Overlay
 from slipcar.envs.parameters import Parameters
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.sources import base_of, longest_horizon, source_of
+from slipcar.envs.spec import PlainSpec
 from slipcar.envs.transition import control_from_action, goal_cost, proximity, step
 from slipcar.envs.validate import checked_array, checked_int
 
@@ -52,7 +53,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Observation space
     `observation="features"` (12 numbers of order one) or `"state"` (r_x, r_y, θ, v, ω, t);
-    float32 with finite bounds. The tables are in :mod:`slipcar.envs.observation`.
+    float32. The tables are in :mod:`slipcar.envs.observation`.
 
     ## Reward
     −(dt ‖u‖² + dt λ Σ_o max(0, (δ_o+ε)² − ‖r−r_o‖²)²) a step and, on the last,
@@ -100,6 +101,7 @@ class SlipCarEnv(gym.Env[np.ndarray, np.ndarray]):
         "render_modes": list(RENDER_MODES),
         "render_fps": RENDER_FPS,
     }
+    spec: Any = PlainSpec()
 
     def __init__(
         self,

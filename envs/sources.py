@@ -9,7 +9,7 @@ import numpy as np
 
 from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
-from slipcar.envs.validate import parsed_object
+from slipcar.envs.validate import MARK, parsed_object
 
 #: What an environment draws its episodes' worlds from.
 Source: TypeAlias = Scenario | Family
@@ -26,7 +26,7 @@ def source_of(value: Any) -> Source:
     if isinstance(value, str):
         if value.startswith("family:"):
             return Family.named(value.removeprefix("family:"))
-        if not value.lstrip().startswith("{"):
+        if not value.removeprefix(MARK).lstrip().startswith("{"):
             return Scenario.named(value)
         value = parsed_object(value, "scenario or family")
     # A family is told by its base: what a scenario must have, a start, it has not.

@@ -74,6 +74,16 @@ def checked_dtype(dtype: Any) -> torch.dtype:
     raise ValueError(f"unknown dtype {dtype!r}; allowed are {list(DTYPES)}")
 
 
+def dtype_of_network(network: Any) -> torch.dtype | None:
+    """The dtype that a network's parameters have, the first that is real; None without any.
+
+    It need not be that of an observation: with `torch.set_default_dtype(torch.float64)` it is not.
+    """
+    if not isinstance(network, torch_module().nn.Module):
+        return None
+    return next((p.dtype for p in network.parameters() if p.is_floating_point()), None)
+
+
 def tensor(values: Any, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
     """A copy of an array on a device."""
     torch = torch_module()

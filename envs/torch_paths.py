@@ -26,6 +26,7 @@ from slipcar.envs.torch_backend import (
     checked_device,
     checked_dtype,
     compiled,
+    dtype_of_network,
     tensor,
     torch_module,
 )
@@ -174,8 +175,9 @@ def observed(
 
     Args:
         scenario: the world.
-        network: observations (paths, d) in the states' dtype to actions (paths, 2), which are
-            limited to [−1, 1] and scaled by the scenario's control bounds.
+        network: observations (paths, d) to actions (paths, 2), which are limited to [−1, 1] and
+            scaled by the scenario's control bounds. It is shown the dtype of its own parameters,
+            if it has some, else the states'.
         observation: `"features"`, `"state"` or `"egocentric"`.
         obstacle_slots: how many of the nearest obstacles are seen.
 
@@ -195,7 +197,8 @@ def observed(
         (p, scale), components = numbers(x.device, x.dtype), x.unbind(dim=-1)
         rims = proximity(p, components, functions)[2] if layout.slots else None
         seen = observe(layout, p, t, components, rims, functions)
-        return torch.clamp(network(seen), -1.0, 1.0) * scale
+        answer = network(seen.to(dtype_of_network(network) or seen.dtype))
+        return torch.clamp(answer, -1.0, 1.0).to(scale.dtype) * scale
 
     return policy
 

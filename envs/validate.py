@@ -5,11 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import numbers
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 T = TypeVar("T")
+
+#: The byte order mark, as some editors begin a file in UTF-8.
+MARK = "\ufeff"
 
 
 def checked_array(
@@ -74,6 +78,26 @@ def checked_int(name: str, value: Any, *, at_least: int, at_most: int | None = N
     return number
 
 
+def read_text(path: str | Path) -> str:
+    """A text file in UTF-8, with or without the byte order mark that some editors write.
+
+    Raises:
+        ValueError: for another encoding, naming the file and the encoding.
+        OSError: if it cannot be read.
+    """
+    content = Path(path).read_bytes()
+    encoding = json.detect_encoding(content)  # by a byte order mark, or by where zeros are
+    if not encoding.startswith("utf-8"):
+        raise ValueError(f"{path} is written in {encoding.upper()}: save it as UTF-8")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        byte, place = content[error.start], error.start
+        raise ValueError(
+            f"{path} is not written in UTF-8 (byte 0x{byte:02x} at {place}): save it as UTF-8"
+        ) from None
+
+
 def parsed_object(text: Any, kind: str) -> dict[str, Any]:
     """The object that JSON text describes.
 
@@ -81,8 +105,8 @@ def parsed_object(text: Any, kind: str) -> dict[str, Any]:
         ValueError: if it is no text, no JSON, or no object.
     """
     try:
-        data = json.loads(text)
-    except (json.JSONDecodeError, TypeError) as error:
+        data = json.loads(text.removeprefix(MARK) if isinstance(text, str) else text)
+    except (ValueError, TypeError) as error:
         raise ValueError(f"not a {kind}: the text is not JSON ({error})") from error
     if not isinstance(data, dict):
         raise ValueError(f"not a {kind}: expected a JSON object, not {type(data).__name__}")

@@ -10,6 +10,8 @@ import importlib
 import sys
 from collections.abc import Callable, Sequence
 
+from slipcar.evaluation.terminal import speak_plainly
+
 #: Command -> what `slipcar --help` says of it. A command is a function in a module of its name;
 #: it is imported when asked for, because help should not take a second.
 COMMANDS = {
@@ -44,6 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     import tyro
 
+    speak_plainly()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         if arguments and arguments[0] in COMMANDS:

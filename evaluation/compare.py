@@ -20,7 +20,7 @@ from slipcar.evaluation.noise import BLOCK
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.report import comparison as report
-from slipcar.evaluation.rollout import check_counts, evaluate
+from slipcar.evaluation.rollout import checked_counts, evaluate
 from slipcar.evaluation.runs import Runs, trainings
 from slipcar.evaluation.statistics import episodes_for, half_width, rate_interval
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, Row, Swept, message, sweep
@@ -87,9 +87,11 @@ def compare(
     if resolution is not None:
         episodes_for(resolution, 0.0)  # raises now if it is out of range
     fixed = episodes if episodes is not None else None if resolution is not None else 10_000
-    check_counts(PILOT if fixed is None else fixed, seed, substeps, None, n_jobs)
+    counted = checked_counts(PILOT if fixed is None else fixed, seed, substeps, n_jobs)
+    _, seed, substeps, n_jobs = counted
+    fixed = None if fixed is None else counted.episodes
     if time_limit is not None:
-        checked_float("time_limit", time_limit, above=0.0)
+        time_limit = checked_float("time_limit", time_limit, above=0.0)
     if not controllers:
         raise ValueError("compare needs at least one controller, not an empty mapping")
     for name, controller in controllers.items():

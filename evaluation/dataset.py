@@ -29,9 +29,10 @@ import numpy as np
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.validate import checked_int
 from slipcar.evaluation.cells import controller_fingerprint
 from slipcar.evaluation.controller import Controller, controller_name
-from slipcar.evaluation.episodes import Episodes, record
+from slipcar.evaluation.episodes import Episodes, checked_recording, record
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.rollout import solver_failures
 
@@ -114,6 +115,8 @@ def write_dataset(
     """
     scenario = Scenario.of(scenario)
     root = check_request(dataset_id, folder, overwrite)
+    episodes, seed, exploration_noise = checked_recording(episodes, seed, exploration_noise)
+    obstacle_slots = checked_int("obstacle_slots", obstacle_slots, at_least=0)
     parts = record(
         controller,
         scenario,
@@ -154,7 +157,7 @@ def write_dataset(
         metadata = {
             **_metadata(written, controller, scenario, algorithm_name, description),
             "seed": seed,
-            "exploration_noise": float(exploration_noise),
+            "exploration_noise": exploration_noise,
             "observation": layouts.describe(observation, obstacle_slots),
         }
         optional = {"author": author and {author}, "code_permalink": code_permalink}

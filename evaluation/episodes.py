@@ -78,7 +78,7 @@ def record(
         ValueError: for a bad argument, or an action of wrong shape or not finite.
     """
     scenario = Scenario.of(scenario)
-    check_recording(episodes, seed, exploration_noise)
+    episodes, seed, exploration_noise = checked_recording(episodes, seed, exploration_noise)
     layout = layout_for(scenario, observation, obstacle_slots)
     scenario.action_scale  # noqa: B018  raises now if the scenario is unbounded
     check_controller(controller)
@@ -86,11 +86,13 @@ def record(
     return _blocks(controller, scenario, episodes, seed, layout, exploration_noise)
 
 
-def check_recording(episodes: int, seed: int, exploration_noise: float) -> None:
-    """Raises ValueError for what :func:`record` cannot do, naming the bad value."""
-    checked_int("episodes", episodes, at_least=1)
-    checked_int("seed", seed, at_least=0)
-    checked_float("exploration_noise", exploration_noise, at_least=0.0)
+def checked_recording(episodes: int, seed: int, exploration_noise: float) -> tuple[int, int, float]:
+    """These as Python's numbers; ValueError for what :func:`record` cannot do, naming the value."""
+    return (
+        checked_int("episodes", episodes, at_least=1),
+        checked_int("seed", seed, at_least=0),
+        checked_float("exploration_noise", exploration_noise, at_least=0.0),
+    )
 
 
 def _blocks(

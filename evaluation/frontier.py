@@ -34,7 +34,7 @@ from slipcar.evaluation.frontier_record import (
     undominated,
 )
 from slipcar.evaluation.report import frontier as report_frontier
-from slipcar.evaluation.rollout import check_counts
+from slipcar.evaluation.rollout import checked_counts
 from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan
 
 __all__ = [
@@ -102,7 +102,7 @@ def frontier(
             planned.
     """
     scenario = Scenario.of(scenario)
-    check_counts(episodes, seed, substeps, None, n_jobs)
+    episodes, seed, substeps, n_jobs = checked_counts(episodes, seed, substeps, n_jobs)
     if not len(scenario.obstacles):
         raise ValueError("a frontier needs a scenario with obstacles: without, nothing is risked")
     receding_episodes = min(

@@ -13,13 +13,13 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.integrate import added_up
-from slipcar.envs.options import check_slots
+from slipcar.envs.options import check_seen
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.transition import Transition, control_from_action, transition
 from slipcar.envs.validate import checked_int
@@ -62,20 +62,27 @@ class Step:
     failures: np.ndarray | None
 
 
-def check_counts(
-    episodes: int, seed: int, substeps: int, batch_size: int | None, n_jobs: int
-) -> None:
-    """Check the numbers that say what to run.
+class Counts(NamedTuple):
+    """Numbers that say what to run, as Python's own, which every file can hold."""
+
+    episodes: int
+    seed: int
+    substeps: int
+    n_jobs: int
+
+
+def checked_counts(episodes: int, seed: int, substeps: int, n_jobs: int) -> Counts:
+    """The numbers that say what to run; NumPy's integers are numbers, too.
 
     Raises:
         ValueError: naming the bad one and what is allowed.
     """
-    checked_int("episodes", episodes, at_least=1)
-    checked_int("seed", seed, at_least=0)
-    checked_int("substeps", substeps, at_least=1)
-    checked_int("n_jobs", n_jobs, at_least=1)
-    if batch_size is not None:
-        checked_int("batch_size", batch_size, at_least=1)
+    return Counts(
+        episodes=checked_int("episodes", episodes, at_least=1),
+        seed=checked_int("seed", seed, at_least=0),
+        substeps=checked_int("substeps", substeps, at_least=1),
+        n_jobs=checked_int("n_jobs", n_jobs, at_least=1),
+    )
 
 
 def evaluate(
@@ -117,7 +124,9 @@ def evaluate(
             names the controller, the step and the episode.
     """
     scenario = Scenario.of(scenario)
-    check_counts(episodes, seed, substeps, batch_size, n_jobs)
+    episodes, seed, substeps, n_jobs = checked_counts(episodes, seed, substeps, n_jobs)
+    if batch_size is not None:
+        batch_size = checked_int("batch_size", batch_size, at_least=1)
     check_controller(controller)
     blocks = -(-episodes // BLOCK)
     if batch_size is None:
@@ -167,8 +176,7 @@ def sample_paths(
         ValueError: as :func:`evaluate`.
     """
     scenario = Scenario.of(scenario)
-    checked_int("episodes", episodes, at_least=1)
-    checked_int("seed", seed, at_least=0)
+    episodes, seed, *_ = checked_counts(episodes, seed, 1, 1)
     check_controller(controller)
     states = np.empty((episodes, scenario.nodes, 5))
     controls = np.empty((episodes, scenario.nodes - 1, 2))
@@ -208,7 +216,7 @@ def play(
     hidden: list[Any] = [None] * len(chunks)
     starts = np.ones(chunk, dtype=bool)
     layout = observation_layout(controller)
-    check_slots(layout, scenario)
+    check_seen(layout, scenario)
     x = block_starts(seed, block, scenario)[:rows]
     noise = block_noise(seed, block, scenario, substeps)
     for k, variates in enumerate(noise):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.newton.posing import Posed
-from slipcar.planner.options import Options, check_count
+from slipcar.planner.options import Options, check_count, plain
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan, plan_of
 from slipcar.planner.problem.model import Model
@@ -56,6 +56,7 @@ def plan_batch(
         ValueError: for a wrong option, shape or value, naming its index in the batch.
     """
     began = time.perf_counter()
+    options = {name: plain(value) for name, value in options.items()}
     free_first = options.pop("free_first", None)
     known = {field.name for field in dataclasses.fields(Options)} - {"callback"}
     if unknown := sorted(set(options) - known):

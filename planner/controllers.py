@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.planner.actuation import actuation_of
 from slipcar.planner.moments import gains as tracking
 from slipcar.planner.moments.gains import closed_loop_covariance, weight_matrix, wrap
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
+from slipcar.planner.problem.control_set import project_controls
 from slipcar.planner.problem.model import model_of
 from slipcar.planner.search.replanning import applied
 
@@ -30,6 +31,10 @@ class OpenLoop:
         plan: what is played.
         observation: the kind of observation it would rather be given.
         closed_loop: False.
+
+    Raises:
+        ValueError: if the plan was loaded from a file that lacks what playing it takes; see
+            :mod:`slipcar.planner.actuation`.
     """
 
     observation = "state"
@@ -37,7 +42,8 @@ class OpenLoop:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._angles = tuple(getattr(plan.problem, "angles", ()))
+        self._actuation = actuation_of(plan)
+        self._angles = self._actuation.angles
 
     @property
     def preparation_time(self) -> float:
@@ -90,9 +96,8 @@ class OpenLoop:
 
     def _limits(self) -> tuple[Array, Array, float]:
         """Lower and upper bounds and the ball's radius, of the plan's problem."""
-        problem, m = self.plan.problem, self.plan.controls.shape[1]
-        bounds = control_limits(getattr(problem, "control_bounds", None), m)
-        return *bounds, control_ball(getattr(problem, "control_radius", None), *bounds)
+        actuation = self._actuation
+        return actuation.lower, actuation.upper, actuation.radius
 
     def _action(self, u: Array) -> Array:
         encode = getattr(self.plan.problem, "encode_control", None)
@@ -101,7 +106,8 @@ class OpenLoop:
     def _interval(self, t: Any) -> Array:
         # Observations are float32, so a node's time may come back a little early.
         times = self.plan.times
-        slack = 1e-3 * np.min(np.diff(times))
+        rounding = np.finfo(np.float32).eps * (times[-1] - times[0])
+        slack = max(1e-3 * np.min(np.diff(times)), rounding)
         k = np.searchsorted(times, np.asarray(t) + slack, side="right") - 1
         return np.clip(k, 0, len(times) - 2)
 
@@ -136,7 +142,8 @@ class Feedback(OpenLoop):
         Qf: weight on the final deviation; default 100.
 
     Raises:
-        ValueError: for a weight of wrong shape or sign, or gains of wrong shape.
+        ValueError: for a weight of wrong shape or sign, or gains of wrong shape; or if the plan was
+            loaded from a file that lacks what playing it takes.
     """
 
     closed_loop = True
@@ -145,7 +152,7 @@ class Feedback(OpenLoop):
         n, m = plan.mean.shape[1], plan.controls.shape[1]
         gains = plan.gains
         if gains is None:
-            own = getattr(plan.problem, "control_weight", np.eye(m))
+            own = actuation_of(plan).weight
             weights = (
                 weight_matrix("Q", tracking.default_tracking(n) if Q is None else Q, n),
                 weight_matrix("R", own if R is None else R, m, definite=True),

@@ -178,6 +178,11 @@ class Guesses:
             check_number("time_weight", self.time_weight)
 
 
+def plain(value: Any) -> Any:
+    """A NumPy scalar as Python's number or truth value, which every file can hold; others as is."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def check_choice(name: str, value: Any, known: Collection[str]) -> None:
     """Raise ValueError unless the value is one of the known ones."""
     if not isinstance(value, str) or value not in known:

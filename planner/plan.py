@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner import plan_file
+from slipcar.planner.actuation import Actuation
 from slipcar.planner.extremal.certificate import Certificate, certify
 from slipcar.planner.extremal.shooting import Shot
 from slipcar.planner.moments.covariance import trace_integral
@@ -51,6 +52,8 @@ class Plan:
         solve_time: wall-clock seconds of `plan`, callback included.
         options: what `plan` was called with.
         problem: the problem planned for; None after loading if it could not be saved.
+        actuation: what controllers need of a problem that could not be saved, from the file; None
+            where `problem` is known.
         message: what is lacking, the solver's own words if it failed, which guess was taken.
         alternatives: what became of each guess, the best first, when there were several starts.
         time_search: every horizon tried, when the final time was free.
@@ -86,6 +89,7 @@ class Plan:
     shot: Shot | None = None
     expected: ExpectedCost | None = None
     risk: Risk | None = None
+    actuation: Actuation | None = None
 
     @property
     def cost(self) -> float:
@@ -127,10 +131,21 @@ class Plan:
         return dataclasses.replace(self, **changes)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write everything but the history's arrays of functions to an .npz file, atomically.
+        """Write everything but `shot` and functions of the problem to an .npz file, atomically.
 
         The problem is kept if it has `to_json()` and its class is registered under the entry
-        point group `slipcar.problems` (Scenario is).
+        point group `slipcar.problems` (Scenario is). Of any other the control bounds, weight and
+        angles are kept, so that `OpenLoop` and `Feedback` of the loaded plan act as before; its
+        functions are not, and what needs them (`certificate`) says so.
+
+        Args:
+            path: `.npz` is added to a name without it; :meth:`load` finds the file by either.
+
+        Returns:
+            The file.
+
+        Raises:
+            OSError: if it cannot be written, naming it.
         """
         return plan_file.write(self, path)
 
@@ -139,7 +154,7 @@ class Plan:
         """Read what :meth:`save` wrote. No pickled code is run.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if there is no such file, with or without `.npz`.
             ValueError: if it is no plan, is damaged or has another format.
         """
         return cls(**plan_file.read(path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -13,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner import records
+from slipcar.planner.actuation import Actuation
 from slipcar.planner.records import Columns, Iteration
 from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
 
 Array = np.ndarray
 
-#: 2: running costs, alternatives, horizons tried. 3: expected cost and risk.
-_FORMAT, _READ = 3, (2, 3)
+#: 2: running costs, alternatives, horizons tried. 3: expected cost and risk. 4: actuation.
+_FORMAT, _READ = 4, (2, 3, 4)
 _ARRAYS = ("times", "mean", "controls", "covariance", "guess", "A", "B", "gains")
 _SCALARS = (
     "effort", "obstacle_cost", "running_cost", "variance", "iterations", "solve_time", "message",
@@ -30,12 +32,15 @@ _COLUMNS = [field.name for field in dataclasses.fields(Iteration)]
 
 def write(plan: Any, path: str | os.PathLike[str]) -> Path:
     """Write a plan, atomically; see `Plan.save`."""
-    path = Path(path)
-    if path.suffix != ".npz":
-        path = path.with_name(path.name + ".npz")
+    path = _named(path)
     arrays = {name: getattr(plan, name) for name in _ARRAYS if getattr(plan, name) is not None}
     arrays |= {f"multipliers.{k}": v for k, v in plan.multipliers.as_dict().items()}
     arrays |= {f"history.{k}": v for k, v in _columns(plan.history).items()}
+    actuation = plan.actuation
+    if plan.problem is not None:
+        actuation = Actuation.of(plan.problem, plan.controls.shape[1])
+    if actuation is not None:
+        arrays |= {f"actuation.{k}": v for k, v in actuation.as_dict().items()}
     header = {
         "format": _FORMAT,
         "status": plan.status.name,
@@ -49,31 +54,57 @@ def write(plan: Any, path: str | os.PathLike[str]) -> Path:
         "risk": None if plan.risk is None else plan.risk.as_dict(),
         **{name: getattr(plan, name) for name in _SCALARS},
     }
-    arrays["header"] = np.array(json.dumps(header))
+    arrays["header"] = np.array(json.dumps(header, default=_plain))
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp.npz")
     try:
         np.savez_compressed(temporary, allow_pickle=False, **arrays)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        # It names the temporary file, which nobody asked for.
+        raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
     return path
+
+
+def _named(path: str | os.PathLike[str]) -> Path:
+    """The file of a plan of this name."""
+    path = Path(path)
+    return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's scalars and arrays as JSON's numbers and lists."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    raise TypeError(f"a plan's options must be numbers and texts to be saved, not {value!r}")
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The fields of the plan that :func:`write` wrote; see `Plan.load`."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no plan at {path}")
+    named = _named(path)
+    file_path = named if named.is_file() else Path(path)  # a file may have been renamed
+    if not file_path.is_file():
+        beside = "" if named == Path(path) else f" or {named}"
+        raise FileNotFoundError(f"no plan at {path}{beside}")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(file_path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
         version = header.get("format")
     except Exception as error:  # zipfile, NumPy and JSON each raise their own
         raise ValueError(f"{path} is not a plan or is damaged: {error}") from error
     if version not in _READ:
-        raise ValueError(f"{path} has plan format {version!r}; this version reads {_FORMAT}")
+        raise ValueError(f"{path} has plan format {version!r}; this version reads {list(_READ)}")
     expected, risk = header.get("expected"), header.get("risk")  # not in format 2
     try:
+        problem = _problem_from_data(header["problem"])
+        actuation = _strip(arrays, "actuation.") if problem is None else {}  # not before 4
         return {
             **{name: arrays[name] for name in _ARRAYS if name != "gains"},
             **{name: header[name] for name in _SCALARS},
@@ -82,7 +113,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
             "history": _history(_strip(arrays, "history.")),
             "multipliers": records.Multipliers.from_dict(_strip(arrays, "multipliers.")),
             "options": header["options"],
-            "problem": _problem_from_data(header["problem"]),
+            "problem": problem,
+            "actuation": Actuation.from_dict(actuation) if actuation else None,
             "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
             "time_search": tuple(records.TimeStep(**row) for row in header["time_search"]),
             "expected": records.ExpectedCost(**expected) if expected else None,

@@ -10,7 +10,7 @@ import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solver
 from slipcar.planner.newton.posing import Posed
-from slipcar.planner.options import Guesses, Options
+from slipcar.planner.options import Guesses, Options, plain
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan, plan_of, steered_fields
 from slipcar.planner.problem.checks import check_derivatives as compare_derivatives
@@ -81,7 +81,7 @@ def plan(
         ValueError: for an option or a problem's function out of range, naming it; for functions
             that can neither be traced nor differentiated, and assumptions that do not hold.
     """
-    asked, began = locals(), time.perf_counter()
+    asked, began = {name: plain(value) for name, value in locals().items()}, time.perf_counter()
     request, guesses = _of(Request, asked), _of(Guesses, asked)
     if shooting and compiled:
         raise ValueError("shooting=True watches each iterate: leave compiled=True out")

@@ -19,7 +19,7 @@ PACKAGES = {
 }
 
 # What users import and what they get back; its records are known to all rooms but `trace`.
-RECORDS = {"status", "options", "records", "outcome"}
+RECORDS = {"status", "options", "records", "outcome", "actuation"}
 HALL = {"__init__", "planning", "plan", "batch", "receding_horizon", "controllers", "plan_file"}
 # Room -> the rooms below it, which it may import.
 GROUND = {"problem", "trace"}

@@ -97,10 +97,10 @@ def compare(
         figures: draw the figures as well (needs matplotlib).
         resume: reuse finished work found in the folder.
     """
-    from slipcar.evaluation.rollout import check_counts
+    from slipcar.evaluation.rollout import checked_counts
 
     fine = None if resolution is None else percentage("--resolution", resolution)
-    check_counts(1 if episodes is None else episodes, seed, substeps, None, workers)
+    checked_counts(1 if episodes is None else episodes, seed, substeps, workers)
     if not time_limit > 0.0:
         raise ValueError(f"--time-limit must be > 0 seconds, not {time_limit:g}")
     place = folder or Path("results") / ("compare" if suite == "paper" else suite)

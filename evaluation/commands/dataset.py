@@ -68,13 +68,13 @@ def dataset(
         description: what others should know of it.
     """
     from slipcar.evaluation.dataset import check_request, write_dataset
-    from slipcar.evaluation.episodes import check_recording
+    from slipcar.evaluation.episodes import checked_recording
     from slipcar.evaluation.statistics import standard_error
 
     out = console()
     world = None if scenario is None else read_scenario(scenario)
     Layout(observation, obstacle_slots)  # all that can be checked before any planning
-    check_recording(episodes, seed, exploration_noise)
+    checked_recording(episodes, seed, exploration_noise)
     check_request(dataset_id, folder, overwrite)
     driver, world = read_controller(controller, world, trust)
     with _Bar(episodes) as bar:

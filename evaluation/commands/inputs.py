@@ -11,6 +11,7 @@ import tyro
 
 from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.validate import read_text
 from slipcar.evaluation.makers import Maker
 
 if TYPE_CHECKING:
@@ -74,7 +75,10 @@ def read_scenario(text: str) -> Scenario:
         OSError: if the file cannot be read.
     """
     if text.endswith(".json"):
-        return Scenario.from_json(Path(text).read_text(encoding="utf-8"))
+        try:
+            return Scenario.from_json(read_text(text))
+        except ValueError as error:
+            raise ValueError(f"{text}: {error}" if text not in str(error) else error) from error
     kind, colon, seed = text.partition(":")
     if kind == "random" and colon:
         if not seed.isdecimal():

@@ -18,6 +18,7 @@ import numpy as np
 
 from slipcar.envs import observation as layouts
 from slipcar.envs.scenario import Scenario
+from slipcar.envs.torch_backend import dtype_of_network
 from slipcar.evaluation.noise import BLOCK
 from slipcar.evaluation.own.digest import behaviour_digest
 
@@ -130,11 +131,11 @@ class StateFunction:
 class ActionFunction:
     """A function of the observation as a controller, a network or not: a = f(o).
 
-    Networks of torch are evaluated without gradients, on their own device, in float32 and in
-    evaluation mode. Agents in CleanRL's manner give their mean action: `actor_mean(o)`, or the
-    third of what `get_action(o)` returns (SAC). One that has `get_action_and_value` alone is
-    sampled, with noise that depends on nothing but what it is shown, so that the same paths give
-    the same numbers.
+    Networks of torch are evaluated without gradients, on the device and in the dtype of their own
+    parameters, and in evaluation mode. Agents in CleanRL's manner give their mean action:
+    `actor_mean(o)`, or the third of what `get_action(o)` returns (SAC). One that has
+    `get_action_and_value` alone is sampled, with noise that depends on nothing but what it is
+    shown, so that the same paths give the same numbers.
 
     Attributes:
         function: o (rows, d) float32 -> actions (rows, 2), clipped to [−1, 1] by the evaluation.
@@ -181,8 +182,9 @@ class ActionFunction:
 
         agent = self.function
         first = next(iter(agent.parameters()), None) if is_module(agent) else None
-        device = None if first is None else first.device
-        shown = torch.from_numpy(np.ascontiguousarray(rows)).to(device)
+        shown = torch.from_numpy(np.ascontiguousarray(rows))
+        if first is not None:
+            shown = shown.to(first.device, dtype_of_network(agent))
         training = bool(getattr(agent, "training", False))
         if training:
             agent.eval()

@@ -93,7 +93,7 @@ def load_model(path: str | Path, *, trust: bool = False) -> StoredModel:
             f"pip install 'slipcar[rl]'" + (" sb3-contrib" if package == "sb3_contrib" else "")
         ) from error
     try:
-        model = cls.load(path, device="cpu")
+        model = _loaded(cls, path)
     except Exception as error:  # whatever unpickling someone's file raises
         raise ValueError(
             f"{path} cannot be loaded as {algorithm}: {type(error).__name__}: {error}"
@@ -102,6 +102,18 @@ def load_model(path: str | Path, *, trust: bool = False) -> StoredModel:
     layout = observation_layout(model)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     return StoredModel(model, layout.kind, layout.slots, digest)
+
+
+def _loaded(cls: Any, path: Path) -> Any:
+    """A model on the processor; in float32, as it was trained, whatever torch's default is now."""
+    import torch
+
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        return cls.load(path, device="cpu")
+    finally:
+        torch.set_default_dtype(dtype)
 
 
 def algorithm_of(path: str | Path) -> str:

@@ -126,8 +126,7 @@ def read_document(folder: str | Path) -> Document:
     """
     path = Path(folder) / FILE
     try:
-        text = path.read_text(encoding="utf-8")
-        return from_json(text)
+        return from_json(path.read_bytes().decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     except ValueError as error:

@@ -28,7 +28,7 @@ from slipcar.evaluation.reproduction.runs import (
     played,
     reference_file,
 )
-from slipcar.evaluation.rollout import check_counts
+from slipcar.evaluation.rollout import checked_counts
 from slipcar.planner import plan
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def reproduce(
         ValueError: for a bad argument, or a file that is no reference.
         OSError: if the reference cannot be read.
     """
-    check_counts(episodes, seed, 1, None, n_jobs)
+    episodes, seed, _, n_jobs = checked_counts(episodes, seed, 1, n_jobs)
     s = Scenario.named("paper")
     told = reference_file() if reference is None else Path(reference)
     steps = len(PLANS) + len(CLEARANCES) / SWEEP + 4.0

@@ -22,7 +22,7 @@ from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.provenance import provenance
 from slipcar.evaluation.report.comparison import save_document
 from slipcar.evaluation.report.document import Document
-from slipcar.evaluation.rollout import check_counts
+from slipcar.evaluation.rollout import checked_counts
 from slipcar.evaluation.runs import trainings
 from slipcar.evaluation.suites.records import Suite, SuiteResult, Variant
 from slipcar.evaluation.sweep import TIME_LIMIT, Job, sweep
@@ -58,7 +58,8 @@ def run_suite(
         OSError: if the cluster does not answer.
         LostWorkersError: if the cluster is gone; finished work is kept.
     """
-    check_counts(suite.episodes, seed, 1, None, n_jobs)
+    episodes, seed, _, n_jobs = checked_counts(suite.episodes, seed, 1, n_jobs)
+    suite = dataclasses.replace(suite, episodes=episodes)
     began = time.perf_counter()
     store = Store(folder, resume)
     jobs = [

@@ -115,7 +115,7 @@ class _Attempt:
         self.linearize_seconds = time.perf_counter() - clock
         lin = self.at.lin
         if not lin.finite:
-            raise ValueError(f"{feasibility.not_finite(lin)} is not finite along the guess")
+            raise ValueError(feasibility.not_finite(model, x, u))
         self.adjoint, self.terminal = np.zeros(lin.defect.shape), np.zeros(lin.g.shape)
         self.trust_multiplier = 0.0
         self.rho = self.first_rho = _FIRST_RHO * max(1.0, feasibility.terminal_force(model, lin))

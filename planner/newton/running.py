@@ -18,7 +18,6 @@ from slipcar.planner.newton.tuning import MEAN, NOISE, Tuning
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.feasibility import not_finite
-from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import Columns, Iteration
 from slipcar.planner.status import Status
@@ -103,7 +102,7 @@ def solve_mean(
     steps = _Steps(workspace, options.callback) if history or options.callback else None
     ending = iterate(workspace, task, tuning, posed.filler, None if steps is None else steps.watch)
     if ending.status is None:
-        raise ValueError(f"{not_finite(linearize(model, x, u))} is not finite along the guess")
+        raise ValueError(not_finite(model, x, u))
     outcome = _outcome(workspace, model, ending, w, steps.columns() if steps else ())
     give_back(workspace)
     return outcome
@@ -288,7 +287,7 @@ def solve_noise(
     tuning = NOISE._replace(renewal=stakes.renewal)
     ending = iterate(workspace, task, tuning, posed.filler)
     if ending.status is None:
-        raise ValueError(f"{not_finite(linearize(model, x, u))} is not finite along the guess")
+        raise ValueError(not_finite(model, x, u))
     steered = _steered(workspace, stakes, ending)
     give_back(workspace)
     return steered

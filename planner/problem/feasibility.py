@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.planner.problem.integrators import change
 from slipcar.planner.problem.linearization import Linearization
 from slipcar.planner.problem.model import Model
 from slipcar.planner.trace.elementwise import magnitude
@@ -102,18 +103,72 @@ def what_lacks(at: Linearization, tolerance: float) -> str:
     return ", ".join(f"g[{j}] = {at.g[j]:.4g}" for j in worst)
 
 
-def not_finite(at: Linearization) -> str:
-    """Which function of the problem gave NaN or infinity."""
-    named = {
-        "drift": (at.defect,),
-        "drift_jacobian": (at.A, at.B),
-        "diffusion": (at.sigma,),
-        "penalty": (at.c,),
-        "penalty_jacobian": (at.C,),
-        "terminal": (at.g,),
-        "terminal_jacobian": (at.G,),
-    }
-    for name, arrays in named.items():
-        if not all(np.isfinite(a).all() for a in arrays):
-            return name
-    return "state_cost or control_cost"
+@np.errstate(all="ignore")
+def not_finite(model: Model, x: Array, u: Array, along: str = "along the guess") -> str:
+    """Which function of the problem gave NaN or infinity along a path, and where: a sentence.
+
+    Args:
+        model: the problem.
+        x: states, (N, n).
+        u: controls, (N−1, m).
+        along: what path that is.
+    """
+    t, last = model.times, len(u)
+    starts = np.arange(last), (t[:-1], x[:-1])
+    ends = np.arange(1, last + 1), (t[1:], x[1:])
+    final = np.arange(last, last + 1), (t[-1:], x[-1:])
+    # The constraint last, for it is charged only where risk has a price.
+    nodes = {
+        "drift": starts, "diffusion": starts, "terminal": final, "penalty": ends,
+        "state_cost": ends, "control_cost": starts, "constraint": ends,
+    }  # fmt: skip
+    nodes = {name: at for name, at in nodes.items() if model.has(name)}
+    for name, (node, at) in nodes.items():
+        given = {"drift": (*at, u), "terminal": at[1:]}.get(name, at)
+        value = np.asarray(getattr(model.problem, name)(*given), dtype=np.float64)
+        if not np.isfinite(value).all():
+            return _where(name, name, value, node, at, u, along)
+    moved = change(model.integrator, model.drift, t[:-1], model.dt, x[:-1], u)
+    if not np.isfinite(moved).all():
+        return _where("drift", "its step to the next node", np.asarray(moved), *starts, u, along)
+    for name, (node, at) in nodes.items():
+        for value in _derivatives(model, name, at, u):
+            if not np.isfinite(value).all():
+                return _where(
+                    f"the derivative of {name}", "it", np.asarray(value), node, at, u, along
+                )
+    return (
+        f"the cost is not finite {along}, though every function is: states go up to "
+        f"{np.abs(x).max():.3g}, controls to {np.abs(u).max():.3g}"
+    )
+
+
+def _derivatives(model: Model, name: str, at: tuple[Array, Array], u: Array) -> tuple[Array, ...]:
+    if name == "drift":
+        return model.drift_jacobian(*at, u)
+    if name == "state_cost":
+        return model.state_cost_derivatives(*at)
+    return (model.jacobians.state(name, *at),)
+
+
+def _where(
+    name: str,
+    label: str,
+    value: Array,
+    node: Array,
+    at: tuple[Array, Array],
+    u: Array,
+    along: str,
+) -> str:
+    """Say which entry of a function's values (nodes, ...) is the first that is not finite."""
+    k, *entry = (int(i) for i in np.argwhere(~np.isfinite(value))[0])
+    t, x = at
+    place = f"node {node[k]}, t = {t[k]:.4g}, x = {_show(x[k])}"
+    if name.endswith("drift"):
+        place += f", u = {_show(u[k])}"
+    bad = f"{label}{entry or ''} = {value[(k, *entry)]}"
+    return f"{name} is not finite {along}: {bad} at {place}"
+
+
+def _show(values: Array) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

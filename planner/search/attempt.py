@@ -232,7 +232,7 @@ def _explained(model: Model, options: Options, outcome: Outcome) -> Outcome:
         return outcome
     at = linearize(model, outcome.x, outcome.u)
     if not at.finite:
-        return outcome.said(f"the iteration left where {not_finite(at)} is finite")
+        return outcome.said(not_finite(model, outcome.x, outcome.u, "where the iteration ended"))
     if far := what_lacks(at, options.terminal_tolerance):
         return outcome.said(f"the terminal condition is not met: {far}")
     return outcome.said(

@@ -41,7 +41,7 @@ def test_shares_are_checked(config):
 def test_ppo_drives_for_the_lighter_goal():
     pytest.importorskip("stable_baselines3")
     from slipcar.baselines.learner import make_learner
-    from slipcar.baselines.session import single_thread
+    from slipcar.baselines.session import training_session
 
     config = PPOConfig(
         total_steps=2 * 8 * 40,
@@ -52,7 +52,7 @@ def test_ppo_drives_for_the_lighter_goal():
         goal_share=0.01,
     )
     seen = []
-    with single_thread():
+    with training_session():
         learner = make_learner(PAPER, config, seed=0)
         learner.after_iteration = lambda: seen.append(learner.rollout_buffer.rewards[-1].mean())
         learner.learn(config.total_steps)

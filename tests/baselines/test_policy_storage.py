@@ -109,6 +109,19 @@ def test_the_ways_to_name_it(tmp_path):
     ]  # and no temporary ones
 
 
+def test_a_name_with_a_dot_is_found_again(tmp_path):
+    policy = load_policy()
+    assert save_policy(policy, tmp_path / "run.v1") == tmp_path / "run.v1"
+    assert load_policy(tmp_path / "run.v1").fingerprint() == policy.fingerprint()
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["run.v1.json", "run.v1.safetensors"]
+
+
+def test_what_cannot_be_written_is_named_as_it_was_asked_for(tmp_path):
+    (tmp_path / "policy.safetensors").mkdir()
+    with pytest.raises(OSError, match=r"policy\.safetensors'$"):
+        save_policy(load_policy(), tmp_path / "policy.json")
+
+
 @pytest.mark.parametrize("suffix", [".safetensors", ".json"])
 def test_a_missing_file(stem, suffix):
     stem.with_name(stem.name + suffix).unlink()

@@ -1,11 +1,13 @@
 """The configuration: SPEC §6's numbers, and what it refuses."""
 
 import dataclasses
+import json
 import re
 
+import numpy as np
 import pytest
 
-from slipcar.baselines import PPOConfig
+from slipcar.baselines import CloneConfig, PathwiseConfig, PPOConfig
 
 
 def test_defaults_are_the_measured_configuration():
@@ -21,6 +23,20 @@ def test_defaults_are_the_measured_configuration():
 def test_iterations_are_whole_and_enough():
     assert PPOConfig(total_steps=10_240).iterations(40) == 1
     assert PPOConfig(total_steps=10_241).iterations(40) == 2
+
+
+@pytest.mark.parametrize("kind", [PPOConfig, PathwiseConfig, CloneConfig])
+def test_numpy_scalars_are_numbers(kind):
+    """Also in what is kept of a training, which is JSON."""
+    plain = kind()
+    scalars = {
+        name: np.array(value)[()] for name, value in vars(plain).items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    } | {"hidden": np.array(plain.hidden)}  # fmt: skip
+    assert len(scalars) >= 7
+    config = kind(**scalars)
+    assert config == plain
+    assert json.loads(json.dumps(config.to_dict())) == json.loads(json.dumps(plain.to_dict()))
 
 
 def test_every_field_has_a_line_of_help():

@@ -204,3 +204,15 @@ def test_bad_actions_and_options_are_refused():
     ours.set_options({"speed": 3})
     with pytest.raises(ValueError, match="speed"):
         ours.reset()
+
+
+def test_an_episode_that_is_cut_off_is_told_as_truncated():
+    """So that Stable-Baselines3 bootstraps there, and at the horizon it does not."""
+    for limit, truncated in ((3, True), (5, False)):
+        env = adapter(2, SHORT, max_episode_steps=limit)
+        env.reset()
+        for _ in range(limit):
+            _, _, done, infos = env.step(np.zeros((2, 2), dtype=np.float32))
+        assert done.all()
+        assert infos[0]["TimeLimit.truncated"] is truncated
+        assert infos[0]["episode"]["l"] == limit

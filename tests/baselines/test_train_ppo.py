@@ -15,7 +15,7 @@ import torch
 from slipcar.baselines import PPOConfig, load_policy, score, train_ppo
 from slipcar.baselines.files import write_atomically
 from slipcar.baselines.learner import make_learner
-from slipcar.baselines.session import single_thread
+from slipcar.baselines.session import training_session
 from slipcar.baselines.validation import validation_worlds
 from slipcar.envs import Family, Scenario
 
@@ -277,7 +277,7 @@ def test_too_few_slots_are_refused_before_training():
 
 
 def test_every_rollout_is_one_whole_episode_in_every_environment():
-    with single_thread():
+    with training_session():
         learner = make_learner(COARSE, TINY, seed=0)
         learner.learn(2 * learner.n_envs * learner.n_steps)
     starts = learner.rollout_buffer.episode_starts

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from slipcar.envs import Family, Scenario
+from slipcar.envs.sources import source_of
 from slipcar.evaluation.cli import COMMANDS, main
 from slipcar.evaluation.commands.inputs import read_controller, read_scenario
 from slipcar.evaluation.makers import chargeable
@@ -243,6 +244,37 @@ def test_scenarios_by_name_seed_and_file(tmp_path):
     path.write_text(Scenario.random(3).to_json(), encoding="utf-8")
     assert read_scenario(str(path)) == Scenario.random(3)
     assert read_scenario("family:easy:4") == Family.named("easy").sample(4)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_scenario_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
+    world = Scenario.random(5)
+    (tmp_path / "world.json").write_text(world.to_json(), encoding=encoding)
+    assert read_scenario(str(tmp_path / "world.json")) == world
+    text = (tmp_path / "world.json").read_text(encoding="utf-8")  # the mark stays in it
+    assert Scenario.from_json(text) == Scenario.of(text) == source_of(text) == world
+
+
+@pytest.mark.parametrize(
+    ("encoding", "message"),
+    [
+        ("utf-16", r"world\.json is written in UTF-16: save it as UTF-8"),
+        ("utf-16-le", r"world\.json is written in UTF-16-LE: save it as UTF-8"),
+        ("utf-32", r"world\.json is written in UTF-32: save it as UTF-8"),
+        ("latin-1", r"world\.json is not written in UTF-8 \(byte 0xe9 at \d+\): save it as UTF-8"),
+    ],
+)
+def test_other_encodings_of_a_scenario_file_are_named(tmp_path, encoding, message):
+    text = json.dumps(Scenario.random(5).to_dict() | {"é": 1}, ensure_ascii=False)
+    (tmp_path / "world.json").write_text(text, encoding=encoding)
+    with pytest.raises(ValueError, match=message):
+        read_scenario(str(tmp_path / "world.json"))
+
+
+def test_a_file_that_is_no_scenario_is_named(tmp_path):
+    (tmp_path / "world.json").write_text("[1, 2]")
+    with pytest.raises(ValueError, match=r"world\.json: not a scenario: expected a JSON object"):
+        read_scenario(str(tmp_path / "world.json"))
 
 
 def test_plans_of_the_mean_are_had_where_chance_reaches_the_speed(tmp_path):

@@ -234,3 +234,27 @@ def test_the_terminal_shows_every_row_and_interval(rows, paper):
     assert f"[{100 * low:.2f}, {100 * high:.2f}]" in text
     assert "RuntimeError: no [fuel]" in text
     assert all(name in text for name in rows)
+
+
+def test_numpy_scalars_are_numbers_in_every_record(paper, tmp_path, replay):
+    """Rows, kept cells and files are the same as with Python's own."""
+    rows = {"a": replay(paper, np.zeros((40, 2)))}
+    scalars = compare(
+        rows,
+        paper,
+        episodes=np.int64(64),
+        seed=np.uint32(1),
+        substeps=np.int8(2),
+        n_jobs=np.int64(1),
+        time_limit=np.float32(60.0),
+        folder=tmp_path / "a",
+    )
+    plain = compare(rows, paper, 64, 1, substeps=2, time_limit=60.0, folder=tmp_path / "a")
+    assert plain.reused == ("a",)
+    scalars.save(tmp_path / "a", figures=False)
+    plain.save(tmp_path / "b", figures=False)
+    read = [json.loads((tmp_path / name / "results.json").read_text()) for name in "ab"]
+    assert read[0]["seed"] == read[1]["seed"] == 1
+    assert read[0]["episodes"] == read[1]["episodes"] == 64
+    result = evaluate(rows["a"], paper, np.int64(64), np.int64(1), batch_size=np.int64(8))
+    assert (type(result.seed), type(result.substeps)) == (int, int)

@@ -335,3 +335,11 @@ def test_a_network_learns_from_a_dataset(folder, teacher):
     assert cloned.total < 0.01 * untrained.total
     assert cloned.total < 0.9 * blind.total
     assert cloned.position_rms < 0.75 * blind.position_rms
+
+
+def test_numpy_scalars_are_numbers_in_the_metadata(folder, teacher):
+    numbers = {"episodes": np.int64(2), "seed": np.uint8(3), "obstacle_slots": np.int64(4)}
+    write_dataset(teacher, "paper", ID, **numbers, exploration_noise=np.float32(0.5))
+    stored = minari.load_dataset(ID).storage.metadata
+    assert (stored["seed"], stored["exploration_noise"]) == (3, 0.5)
+    assert stored["total_episodes"] == 2

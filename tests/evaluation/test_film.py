@@ -1,5 +1,6 @@
 """Films show what happened and what was meant, whole or not at all."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -11,6 +12,7 @@ from slipcar.evaluation import sample_paths
 from slipcar.evaluation.cli import main
 from slipcar.evaluation.recording import overlay_of, record
 from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan
+from slipcar.planner.actuation import Actuation
 
 pytest.importorskip("pygame")
 
@@ -71,7 +73,9 @@ def test_open_loop_shows_its_plan_and_feedback_what_is_left_of_its_noise(planned
 def test_a_plan_with_its_own_gains_shows_its_own_covariance(planned):
     own = plan(PAPER, feedback=True)
     np.testing.assert_array_equal(overlay_of(Feedback(own)).covariances, own.covariance[:, :2, :2])
-    assert overlay_of(Feedback(planned.replace(problem=None))).covariances is None
+    known = dataclasses.replace(Actuation.of(PAPER, 2), translators=())
+    forgotten = planned.replace(problem=None, actuation=known)
+    assert overlay_of(Feedback(forgotten)).covariances is None
 
 
 def test_a_receding_horizon_shows_the_plan_of_each_node():

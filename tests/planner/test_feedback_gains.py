@@ -139,10 +139,9 @@ def test_a_rank_one_weight_of_any_size_passes_in_spite_of_rounding():
     np.testing.assert_array_equal(weight_matrix("Q", np.outer(v, v), 5), np.outer(v, v))
 
 
-def test_a_plan_forgotten_problem_still_gives_gains(stochastic):
-    # A loaded plan may know its problem no more; R is then the identity, as the car's is.
-    known, unknown = Feedback(stochastic), Feedback(stochastic.replace(problem=None))
-    np.testing.assert_array_equal(known.plan.gains, unknown.plan.gains)
+def test_a_plan_without_a_problem_is_not_given_another_weight(stochastic):
+    with pytest.raises(ValueError, match=r"neither its problem nor .*plan.replace\(problem=...\)"):
+        Feedback(stochastic.replace(problem=None))
 
 
 def test_on_the_mean_feedback_plays_the_plan(stochastic):

@@ -52,6 +52,18 @@ def test_every_node_time_survives_its_rounding(planned, kind):
         np.testing.assert_allclose(action * s.control_bounds, p.controls[k], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("N", [41, 4001, 400_001])
+@pytest.mark.parametrize("kind", ["state", "features"])
+def test_however_many_nodes_each_time_is_in_its_interval(planned, paper, kind, N):
+    """Of 400 001 nodes in 5 s, float32 knows each to a twentieth of an interval."""
+    many = planned.replace(times=np.linspace(0.0, 5.0, N), controls=np.zeros((N - 1, 2)))
+    k = np.arange(N - 1)
+    seen = observe(paper, kind, many.times[:-1], np.tile(planned.mean[0], (N - 1, 1)))
+    t, _ = paper.decode_observation(seen)
+    np.testing.assert_array_equal(OpenLoop(many)._interval(t), k)
+    np.testing.assert_array_equal(OpenLoop(many)._interval(t + 0.8 * 5.0 / (N - 1)), k)
+
+
 def test_both_observation_kinds_get_the_same_answer(controller, planned, paper):
     t, x, _ = states(planned, 200, 0.05)
     a, _ = controller.predict(observe(paper, "state", t, x))

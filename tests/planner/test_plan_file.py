@@ -142,9 +142,129 @@ def test_an_own_problem_is_forgotten_but_the_plan_is_not(tmp_path, registered):
     np.testing.assert_array_equal(Feedback(loaded).predict(obs)[0], Feedback(p).predict(obs)[0])
 
 
+class Cart:
+    """x'' = u with a heavy correction, a one-sided bound and an angle that turns along."""
+
+    start, times = np.array([0.0, 0.0, 0.1]), np.linspace(0.0, 2.0, 41)
+    control_weight = 0.01 * np.eye(1)
+    control_bounds = np.array([[-3.0], [4.0]])
+    angles = (2,)
+
+    def drift(self, t, x, u):
+        return np.stack([x[..., 1], u[..., 0], 0.5 * u[..., 0]], -1)
+
+    def diffusion(self, t, x):
+        return np.zeros((*x.shape[:-1], 3, 1))
+
+    def terminal(self, x):
+        return x[..., :2] - np.array([1.0, 0.0])
+
+
+class Discs(Cart):
+    """The same with controls in a ball."""
+
+    control_bounds = None
+    control_radius = 3.5
+
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(200, 4)) * [2.0, 2.0, 9.0, 0.0] + [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("kind", [Cart, Discs])
+def test_a_saved_plan_of_an_own_problem_acts_as_it_did(kind, tmp_path):
+    p = plan_function(kind(), variance_weight=0.0)
+    loaded = Plan.load(p.save(tmp_path / "p"))
+    again = Plan.load(loaded.save(tmp_path / "again"))  # what was kept is kept on
+    for controller in (OpenLoop, Feedback):
+        wanted = controller(p).predict(OBSERVATIONS)[0]
+        for q in (loaded, again):
+            np.testing.assert_array_equal(controller(q).predict(OBSERVATIONS)[0], wanted)
+            assert controller(q).fingerprint() == controller(p).fingerprint()
+    played = Feedback(p).predict(OBSERVATIONS)[0]
+    low, high = (-3.0, 4.0) if kind is Cart else (-3.5, 3.5)
+    assert played.min() == np.float32(low)  # the bounds are what the case is about
+    assert played.max() == np.float32(high)
+
+
+def test_what_a_file_cannot_keep_is_asked_for(tmp_path):
+    class Scaled(Cart):
+        def encode_control(self, u):
+            return u / 4.0
+
+    problem = Scaled()
+    p = plan_function(problem, variance_weight=0.0)
+    loaded = Plan.load(p.save(tmp_path / "p"))
+    for controller in (OpenLoop, Feedback):
+        with pytest.raises(ValueError, match=r"has encode_control, which its file cannot keep"):
+            controller(loaded)
+        given = controller(loaded.replace(problem=problem))
+        wanted = controller(p).predict(OBSERVATIONS)[0]
+        np.testing.assert_array_equal(given.predict(OBSERVATIONS)[0], wanted)
+    with pytest.raises(ValueError, match=r"plan.replace\(problem=...\)"):
+        loaded.certificate  # noqa: B018
+
+
+def test_files_of_the_format_before_are_read_and_say_what_they_lack(planned, tmp_path, registered):
+    def aged(header, arrays):
+        header.update(format=3)
+        for name in [name for name in arrays if name.startswith("actuation.")]:
+            del arrays[name]
+
+    rewrite(path := planned.save(tmp_path / "car"), aged)
+    assert Feedback(Plan.load(path)).fingerprint() == Feedback(planned).fingerprint()
+    own = plan_function(Cart(), variance_weight=0.0)
+    rewrite(path := own.save(tmp_path / "own"), aged)
+    old = Plan.load(path)
+    np.testing.assert_array_equal(old.controls, own.controls)
+    with pytest.raises(ValueError, match="knows neither its problem nor its control bounds"):
+        Feedback(old)
+    again = Feedback(old.replace(problem=Cart()))
+    assert again.fingerprint() == Feedback(own).fingerprint()
+
+
+@pytest.mark.parametrize("name", ["plan.v1", "plan", "plan.npz", ".plan", "plan.npz.old"])
+def test_a_plan_is_found_by_the_name_it_was_given(planned, tmp_path, name):
+    (tmp_path / "plan").mkdir()  # nothing that is there already is taken for it
+    planned.save(tmp_path / name)
+    assert Plan.load(tmp_path / name).effort == planned.effort
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_plan_that_was_renamed_is_read(planned, tmp_path):
+    path = planned.save(tmp_path / "plan").rename(tmp_path / "plan.dat")
+    assert Plan.load(path).effort == planned.effort
+
+
+def test_what_cannot_be_written_is_named_as_it_was_asked_for(planned, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"cannot write .*missing/plan\.npz: .* no folder"):
+        planned.save(tmp_path / "missing" / "plan.npz")
+    (tmp_path / "taken.npz").mkdir()
+    with pytest.raises(OSError, match=r"taken\.npz'?$") as refused:
+        planned.save(tmp_path / "taken.npz")
+    assert ".tmp" not in str(refused.value)
+    assert [f.name for f in tmp_path.iterdir()] == ["taken.npz"]
+
+
+def test_numpy_scalars_are_saved_as_the_numbers_they_are(tmp_path):
+    s = Scenario.named("open")
+    options = {
+        "risk_price": np.arange(3)[1], "starts": np.int64(2), "feedback": np.bool_(True),
+        "tolerance": np.float32(0.5), "max_iterations": np.uint8(30), "expected": np.bool_(False),
+    }  # fmt: skip
+    p = plan_function(s, **options)
+    loaded = Plan.load(p.save(tmp_path / "p"))
+    assert loaded.options == p.options
+    kinds = (bool, int, float, str, type(None))
+    assert all(type(value) in kinds for value in p.options.values())
+    plain = {name: value.item() for name, value in options.items()}
+    assert plan_function(s, **plain).options == p.options
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no plan at .*gone\.npz"):
         Plan.load(tmp_path / "gone.npz")
+    with pytest.raises(FileNotFoundError, match=r"no plan at .*gone or .*gone\.npz"):
+        Plan.load(tmp_path / "gone")
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.9, 0.999])
@@ -180,7 +300,7 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(format=99), "format 99; this version reads 3"),
+        (lambda h, a: h.update(format=99), r"format 99; this version reads \[2, 3, 4\]"),
         (lambda h, a: h.pop("format"), "format None"),
         (lambda h, a: h.pop("effort"), "damaged.*effort"),
         (lambda h, a: h.update(status="FINE"), "damaged.*FINE"),
