@@ -194,6 +194,11 @@ class _Planning:
             }
             if not self.request.feedback:
                 changes["gains"] = None
+            nominal = outcomes[origin]
+            if not (answer.status.ok or nominal.status.ok):
+                # What keeps the mean from converging keeps all that is built on it.
+                both = "; ".join(filter(None, (nominal.message, answer.message)))
+                changes |= {"status": nominal.status, "message": both}
         states, outcome = candidates[origin]
         plan = plan_of(
             outcome, self.model, self.problem, options=self._record(), guess=states,

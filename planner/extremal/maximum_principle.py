@@ -78,9 +78,7 @@ def first_order(
     return FirstOrder(lin, weights, convexify(model, lin, variance=variance))
 
 
-def adjoint_of(
-    model: Model, at: FirstOrder, terminal: Array, *, answered: bool = False
-) -> Array:
+def adjoint_of(model: Model, at: FirstOrder, terminal: Array, *, answered: bool = False) -> Array:
     """λ_1..λ_K by the adjoint recursion from ν = −𝔭 (q,): (K, n), gradients of the cost to go.
 
         λ_k = ∇ℓ_k + A_kᵀ λ_{k+1} + K_kᵀ γ_k,    γ_k = ∂H_k/∂u

@@ -128,7 +128,9 @@ def shoot(
     start = first_order(model, x, u, variance_weight)
     if adjoint is None:
         adjoint = adjoint_of(model, start, terminal)
-    conditions = Conditions(model, variance_weight, terminal_tolerance, scales(model, start, adjoint))
+    conditions = Conditions(
+        model, variance_weight, terminal_tolerance, scales(model, start, adjoint)
+    )
     here = conditions.at(x, u, adjoint, terminal)
     history = [_row(here, 0.0, began)]
     attempted = here.largest <= start_within

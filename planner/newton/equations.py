@@ -197,7 +197,8 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
         "evaluated": Field((len(Evaluation._fields),), True),
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
-        "verified": Field((len(Residuals._fields),), True), "price": Field((n, n), True), "priced": Field((n, n), True),
+        "verified": Field((len(Residuals._fields),), True), "price": Field((n, n), True),
+        "priced": Field((n, n), True),
         "reach": Field((q,), True), "late": Field(()), "noise": Field((), True),
     }  # fmt: skip
     if form.noisy:
@@ -461,8 +462,8 @@ class Equations:
             pull = pull + rows["nu_new"].dot(g)
             miss = magnitude(rows["nu_new"]).dot(magnitude(g))
         promise = Promise(
-            change + self._node_change(rows, d), slope + self._node_slope(rows, d), step, length, radius + rows["dn"] * d.dot(d),
-            pull, gap, miss, changed, total,
+            change + self._node_change(rows, d), slope + self._node_slope(rows, d), step, length,
+            radius + rows["dn"] * d.dot(d), pull, gap, miss, changed, total,
         )  # fmt: skip
         rows.write("promised", np.array(promise, dtype=object))
 

@@ -221,7 +221,8 @@ class Iteration:
             ):
                 released = False
             newton = not released and (
-                iteration >= tuning.free_steps or not self.bold
+                iteration >= tuning.free_steps
+                or not self.bold
                 or (self.tried > 0 and settling < tuning.settled * effort)
             )
             fallback = tuning.falls_back and self.rejected >= tuning.rejections
@@ -338,7 +339,8 @@ class Iteration:
             model, promise, rounds = self._settle_bounds()
             solves += rounds
             if promise is not None and not (
-                self.curvature > 0.0 and curved
+                self.curvature > 0.0
+                and curved
                 and promise.pull - promise.slope < -tuning.bent * (promise.gap + promise.miss)
             ):
                 if solves == rounds:

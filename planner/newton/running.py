@@ -25,7 +25,10 @@ from slipcar.planner.status import Status
 Array = np.ndarray
 
 #: Arrays that every run begins with at zero.
-_CLEARED = ("d", "e", "held", "P", "Sigma", "H_psd", "lam", "lam_new", "nu", "nu_new", "reach", "price", "priced", "law")
+_CLEARED = (
+    "d", "e", "held", "P", "Sigma", "H_psd", "lam", "lam_new", "nu", "nu_new", "reach", "price",
+    "priced", "law",
+)  # fmt: skip
 _CLEARED_NOISY = ("gains", "eta", "offset", "s")
 #: The equations of plans of the mean.
 _MEAN = Form()

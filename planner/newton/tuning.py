@@ -43,7 +43,7 @@ class Tuning(NamedTuple):
 
     free_steps: int = 20
     released_steps: int = 10
-    released: float = 0.005
+    released: float = 0.02
     settled: float = 1.0
     bound_rounds: int = 6
     bound_stiffness: float = 1e12

@@ -46,6 +46,7 @@ _REFINED = 4
 #: Nearly feasible, relative to how far the states move.
 _NEARLY = 1e-3
 
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
     """A problem and where to start."""
