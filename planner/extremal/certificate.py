@@ -263,7 +263,7 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
         terminal_history=np.reshape([h.terminal for h in history], (len(history), q)),
         cost_history=np.array([h.cost for h in history]),
         trust_region_history=np.array([h.trust_region for h in history]),
-        relaxed=lacking > _RELAXED * broken.scales.end.max(),
+        relaxed=lacking > _RELAXED * broken.scales.end.max(initial=0.0),
         violations=broken, adjoint=adjoint,
         adjoint_difference=_largest(off),
         adjoint_off=_largest(off / broken.scales.adjoint),
