@@ -231,7 +231,7 @@ class Iteration:
                 self._confine()
             self._prepare(curved)
             linearized = time.perf_counter()
-            step = self._step(curved, released)
+            step = self._step(newton, curved, released)
             if step is None:
                 return Status.SOLVER_FAILED
             solved = time.perf_counter()
@@ -328,7 +328,7 @@ class Iteration:
 
     # ------------------------------------------------------------------------------- the step
 
-    def _step(self, curved: bool, released: bool) -> _Step | None:
+    def _step(self, newton: bool, curved: bool, released: bool) -> _Step | None:
         """The model's step: bounds settle, and the shift grows until the model is convex."""
         knobs, tuning = self._knobs, self.tuning
         knobs[_HINGES] = 0.0 if released else 1.0
@@ -336,7 +336,7 @@ class Iteration:
         for _ in range(tuning.inertia_trials):
             knobs[_DAMPING] = self.shift if curved else 0.0
             knobs[_CURVED] = self.curvature if curved else 0.0
-            model, promise, rounds = self._settle_bounds()
+            model, promise, rounds = self._settle(newton)
             solves += rounds
             if promise is not None and not (
                 self.curvature > 0.0
@@ -356,11 +356,16 @@ class Iteration:
                     self.curvature = 0.0
         return None
 
-    def _settle_bounds(self) -> tuple[Model, Promise | None, int]:
-        """Solve the LQ problem until the bounds it passes are those it was solved with."""
-        ws, rounds = self.workspace, self.tuning.bound_rounds
+    def _settle(self, newton: bool) -> tuple[Model, Promise | None, int]:
+        """Solve the LQ problem until bounds, and hinges that matter, are those it was solved with.
+
+        Bold steps go through hinges that are off; judged ones see those that would cost as much
+        as the step gains.
+        """
+        ws, tuning, arrays = self.workspace, self.tuning, self.workspace.arrays
         backward, forward = self._backward[self.side], self._forward[self.side]
-        for attempt in range(1, rounds + 1):
+        kept = None
+        for attempt in range(1, tuning.bound_rounds + 1):
             backward()
             model: Model = ws.model()
             if model.bad != 0.0:
@@ -369,15 +374,27 @@ class Iteration:
             promise: Promise = ws.promise()
             if not math.isfinite(promise.total):
                 return model, None, attempt
-            if promise.changed == 0.0:
+            turned = newton and promise.turned != 0.0 and (
+                kept is not None
+                or promise.unseen > tuning.unseen * abs(promise.pull - promise.slope)
+            )
+            if promise.changed == 0.0 and not turned:
                 return model, promise, attempt
-            if attempt < rounds:
-                ws.arrays["held"][:] = ws.arrays["passed"]
+            if attempt < tuning.bound_rounds:
+                arrays["held"][:] = arrays["passed"]
+                if turned:
+                    on = ws.at(self.side, "on")
+                    kept = on.copy() if kept is None else kept
+                    on[:] = arrays["pushed"]
+        if kept is not None:  # hinges do not settle: those of the iterate
+            ws.at(self.side, "on")[:] = kept
+            backward()
+            model = ws.model()
         # The set does not settle: clip the controls and let the states follow.
         self._knobs[_CLIPPED] = 1.0
         forward()
         self._knobs[_CLIPPED] = 0.0
-        return model, ws.promise(), rounds
+        return model, ws.promise(), attempt
 
     def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
