@@ -235,7 +235,7 @@ class Iteration:
             if step is None:
                 return Status.SOLVER_FAILED
             solved = time.perf_counter()
-            trial = self._search(step, newton, fallback)
+            trial = self._search(step, newton, fallback, released)
             self.tried += 1
             shift, there, status = self.shift if curved else 0.0, 1 - self.side, None
             if trial.accepted:
@@ -396,7 +396,7 @@ class Iteration:
         self._knobs[_CLIPPED] = 0.0
         return model, ws.promise(), attempt
 
-    def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
+    def _search(self, step: _Step, newton: bool, fallback: bool, released: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
         model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
         lacking = 1.0 * (promise.gap + promise.miss)
@@ -406,7 +406,7 @@ class Iteration:
         before = at.effort + at.running + model.charged + promise.pull + factor * lacking
         predicted = promise.pull - promise.change + factor * lacking
         size = at.effort + abs(at.running) + model.charged + abs(promise.pull)
-        noise = tuning.noise * size
+        noise, bold = tuning.noise * size, tuning.boldness * (descent + size - abs(promise.pull))
         longest = tuning.longest if self.bold else min(tuning.longest, tuning.careful)
         most = longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
@@ -423,8 +423,9 @@ class Iteration:
             merit = new.effort + new.running + new.charged + new.pull
             merit += factor * 1.0 * (new.gap + new.miss)
             actual = before - merit
+            unseen = new.charged - model.charged if released else 0.0
             accepted = math.isfinite(merit) and (
-                (not newton and actual >= -tuning.boldness * (descent + size - abs(promise.pull)))
+                (not newton and actual + unseen >= -bold)
                 or (descent <= noise and actual >= -noise)
                 or actual >= tuning.armijo * alpha * descent
             )
@@ -498,7 +499,10 @@ class Iteration:
             self._knobs[_ANSWERED] = answered
             self.workspace.kernels["residuals"][self.side]()
             off = self.workspace.residuals()
-            if not (off.gap <= tuning.consistency and off.end <= tuning.feasibility):
+            strict = max(tuning.strictest, min(1.0, 1e2 * math.sqrt(self.task.tolerance)))
+            if not (
+                off.gap <= tuning.consistency * strict and off.end <= tuning.feasibility * strict
+            ):
                 return False
             if off.control <= self.task.tolerance:
                 return True

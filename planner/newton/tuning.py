@@ -38,7 +38,9 @@ class Tuning(NamedTuple):
         defective: defects that cost more than this part of the effort are no extremal's.
         feasibility: what a converged plan may leave of the terminal condition, relative to how far
             the states in it move.
-        consistency: and of its dynamics, all nodes together, relative to how far each state moves.
+        consistency: and of its dynamics, all nodes together, relative to how far each state moves;
+            both are for the default tolerance and larger ones, and smaller with its square root.
+        strictest: by this factor at most.
     """
 
     free_steps: int = 20
@@ -72,6 +74,7 @@ class Tuning(NamedTuple):
     defective: float = 0.1
     feasibility: float = 1e-6
     consistency: float = 1e-5
+    strictest: float = 1e-5
 
 
 #: Of plans of the mean; with every step judged; and of plans that count the noise, which start from
