@@ -435,10 +435,20 @@ class Iteration:
                 alpha *= 0.5
             rolled = True
         square = alpha * alpha
+        step, length = square * promise.step, square * promise.length
+        if rolled:
+            step, length = self._moved(there)
         return _Trial(
-            new, alpha, accepted, merit, predicted, actual, noise, square * promise.step,
-            square * promise.length, square * promise.radius,
+            new, alpha, accepted, merit, predicted, actual, noise, step, length,
+            square * promise.radius,
         )  # fmt: skip
+
+    def _moved(self, there: int) -> tuple[float, float]:
+        """∫ ‖Δu‖² dt and ∫ ΔuᵀRΔu dt from the iterate to a candidate that was rolled out."""
+        ws = self.workspace
+        moved = (ws.at(there, "u") - ws.at(self.side, "u"))[:-1]
+        weighted = ws.arrays["dt"][:-1] * moved
+        return float(np.vdot(weighted, moved)), float(np.vdot(weighted @ ws.at(0, "R")[0], moved))
 
     # -------------------------------------------------------------------------- what follows
 
