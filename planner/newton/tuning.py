@@ -70,10 +70,10 @@ class Tuning(NamedTuple):
     largest_shift: float = 2.0
     least_curvature: float = 0.05
     bent: float = 0.5
-    unseen: float = 10.0
+    unseen: float = 300.0
     defective: float = 0.1
     feasibility: float = 1e-6
-    consistency: float = 1e-5
+    consistency: float = 5e-5
     strictest: float = 1e-5
 
 
