@@ -199,7 +199,6 @@ class Iteration:
             return Ending(None, 0, 0, self.at)
         self._believe(fresh=not task.warm)
         self._backward[0]()  # with kappa zero: how far the last controls move the end
-        self._forward[0]()  # and what defects cost
         self._knobs[_KAPPA] = tuning.terminal_curvature
         self._first_effort = self.at.effort
         status = self._iterate()
@@ -399,7 +398,7 @@ class Iteration:
     def _search(self, step: _Step, newton: bool, fallback: bool, released: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
         model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
-        lacking = 1.0 * (promise.gap + promise.miss)
+        lacking = promise.gap + promise.miss
         descent = promise.pull - promise.slope
         factor = max(1.0, -descent / (0.75 * lacking)) if lacking > 0.0 else 1.0
         descent += factor * lacking
@@ -421,7 +420,7 @@ class Iteration:
                 self._shift[self.side]()
             new = self._evaluated(there)
             merit = new.effort + new.running + new.charged + new.pull
-            merit += factor * 1.0 * (new.gap + new.miss)
+            merit += factor * (new.gap + new.miss)
             actual = before - merit
             unseen = new.charged - model.charged if released else 0.0
             accepted = math.isfinite(merit) and (
@@ -502,9 +501,12 @@ class Iteration:
     def _extremal(self) -> bool:
         """Whether the iterate meets the maximum principle, its dynamics and its end."""
         at = self.at
-        if at.gap + at.miss > self.tuning.defective * (abs(at.effort) + abs(at.running)):
+        tuning, cost = self.tuning, at.effort + abs(at.running)
+        off = at.gap + at.miss
+        if off > tuning.defective * cost or (
+            self.length > tuning.long * at.effort and off > 1e-6 * cost
+        ):
             return False  # not worth a closer look
-        tuning = self.tuning
         for answered in (0.0, 1.0):
             self._knobs[_ANSWERED] = answered
             self.workspace.kernels["residuals"][self.side]()

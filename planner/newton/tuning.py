@@ -36,6 +36,7 @@ class Tuning(NamedTuple):
             that it cannot be reached.
         noise: relative accuracy of the merit function.
         defective: defects that cost more than this part of the effort are no extremal's.
+        long: nor are steps ∫ΔuᵀRΔu dt longer than this part of it, where there are defects.
         feasibility: what a converged plan may leave of the terminal condition, relative to how far
             the states in it move.
         consistency: and of its dynamics, all nodes together, relative to how far each state moves;
@@ -72,6 +73,7 @@ class Tuning(NamedTuple):
     bent: float = 0.5
     unseen: float = 300.0
     defective: float = 0.1
+    long: float = 0.02
     feasibility: float = 1e-6
     consistency: float = 5e-5
     strictest: float = 1e-5
