@@ -354,7 +354,9 @@ class Equations:
         if self.form.noisy:
             return Q, q
         bend = (2.0 * self._knob(rows, "hinges") * rows["dn"]) * rows["weight"] * rows["on"]
-        return self._with_rows(Q, q, loss._replace(slope=bend * rows["c"], curvature=bend), rows["C"])
+        return self._with_rows(
+            Q, q, loss._replace(slope=bend * rows["c"], curvature=bend), rows["C"]
+        )
 
     def _last(self, rows: Rows) -> Carried:
         rows.write("price", rows["priced"])

@@ -373,9 +373,13 @@ class Iteration:
             promise: Promise = ws.promise()
             if not math.isfinite(promise.total):
                 return model, None, attempt
-            turned = newton and promise.turned != 0.0 and (
-                kept is not None
-                or promise.unseen > tuning.unseen * abs(promise.pull - promise.slope)
+            turned = (
+                newton
+                and promise.turned != 0.0
+                and (
+                    kept is not None
+                    or promise.unseen > tuning.unseen * abs(promise.pull - promise.slope)
+                )
             )
             if promise.changed == 0.0 and not turned:
                 return model, promise, attempt
@@ -511,7 +515,7 @@ class Iteration:
             self._knobs[_ANSWERED] = answered
             self.workspace.kernels["residuals"][self.side]()
             off = self.workspace.residuals()
-            strict = max(tuning.strictest, min(1.0, 1e2 * math.sqrt(self.task.tolerance)))
+            strict = max(tuning.strictest, min(1.0, 1e4 * self.task.tolerance))
             if not (
                 off.gap <= tuning.consistency * strict and off.end <= tuning.feasibility * strict
             ):

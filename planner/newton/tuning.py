@@ -40,7 +40,7 @@ class Tuning(NamedTuple):
         feasibility: what a converged plan may leave of the terminal condition, relative to how far
             the states in it move.
         consistency: and of its dynamics, all nodes together, relative to how far each state moves;
-            both are for the default tolerance and larger ones, and smaller with its square root.
+            both are for the default tolerance and larger ones, and smaller in proportion to it.
         strictest: by this factor at most.
     """
 
