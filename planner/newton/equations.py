@@ -192,7 +192,7 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
     }  # fmt: skip
     fields = {
         "number": Field((dims.numbers,), True), "knob": Field((len(KNOBS),), True),
-        "R": Field((m, m), True), "R_inverse": Field((m, m), True), "weight": Field((p,), True),
+        "R": Field((m, m), True), "weight": Field((p,), True),
         "t": Field(()), "dt": Field(()), "dn": Field(()), "lower": Field((m,)),
         "upper": Field((m,)), **point, **{name + NEW: field for name, field in point.items()},
         "d": Field((n,)), "e": Field((m,)), "held": Field((m,)), "passed": Field((m,)),

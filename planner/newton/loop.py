@@ -10,16 +10,19 @@ Each iteration solves one quadratic model, cut down to what is smooth at the ite
 * without a better guess, rows are left out at first, until steps are short: which way round the
   obstacles is then decided by where the free path runs, not by where the guess did;
 * at first the model is that of the paper's convex sub-problem. Whole steps are taken: bold ones
-  are what finds a way. When they are no longer than the controls, or after some number of them,
-  the curvature of dynamics, rows and terminal condition is added, weighed by the multipliers:
-  Newton's method on the optimality conditions, quadratic at the end (with noise charged, whose
-  weights P are held in a step, linear with a factor of some hundredths to tenths);
+  are what finds a way. When they are no longer than the controls, or after some number of them, or
+  where they lead nowhere, the curvature of dynamics, rows and terminal condition is added, weighed
+  by the multipliers: Newton's method on the optimality conditions, quadratic at the end (with noise
+  charged, whose weights P are held in a step, linear with a factor of some hundredths to tenths);
 * where the model is then not convex in the controls (a pivot of the Riccati recursion is not
-  positive), a multiple of the identity is added: a trust region by its multiplier, −p¹ of the
-  paper. A line search on a merit function makes it descend;
+  positive) or along its step, a multiple of R is added: a trust region by its multiplier, −p¹ of
+  the paper. Where that is not enough, the curvature is taken back towards the convex model;
+* a line search on a merit function makes it descend: the linear step first, then roll-outs of its
+  law, which follow the dynamics and so have no defects but what is left of the old ones;
 * after a few rejected steps in a row the convex model's step, searched further, goes first;
-* steps that no longer become shorter go round in circles: then the multiple of the identity is kept
-  from vanishing.
+* steps that no longer become shorter, and do not what the model says, go round in circles: then
+  the multiple of R is kept from vanishing;
+* it ends where the residual of the maximum principle, measured anew at the iterate, is small.
 
 Plans that count the noise start from a plan of the mean, with curvature from the first step on.
 After each step the belief follows: covariance, rows' spread, weights P and gains K
@@ -438,11 +441,11 @@ class Iteration:
                 alpha *= 0.5
             rolled = True
         square = alpha * alpha
-        step, length = square * promise.step, square * promise.length
+        moved, length = square * promise.step, square * promise.length
         if rolled:
-            step, length = self._moved(there)
+            moved, length = self._moved(there)
         return _Trial(
-            new, alpha, accepted, merit, predicted, actual, noise, step, length,
+            new, alpha, accepted, merit, predicted, actual, noise, moved, length,
             square * promise.radius,
         )  # fmt: skip
 

@@ -89,21 +89,6 @@ class Model:
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @functools.cached_property
-    def R_inverse(self) -> Array:  # noqa: N802
-        """R⁻¹, (m, m)."""
-        return np.linalg.inv(self.R)
-
-    @functools.cached_property
-    def unit(self) -> float:
-        """The largest diagonal entry of R: the scale of what is added to Hessians."""
-        return float(self.R.diagonal().max())
-
-    @functools.cached_property
-    def longest_dt(self) -> float:
-        """The longest interval [s]."""
-        return float(self.dt.max())
-
-    @functools.cached_property
     def jacobians(self) -> Jacobians:
         """Derivatives of the functions as they are now."""
         return Jacobians(self.problem, self.state_dim, self.control_dim)
@@ -333,7 +318,7 @@ def _checked(problem: Any) -> Model:
         radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
         weight=_checked_penalties(problem, times[:2], start, len(R)),
     )
-    for name in ("state_dim", "control_dim", "bounded", "R_inverse", "unit", "longest_dt"):
+    for name in ("state_dim", "control_dim", "bounded"):
         getattr(model, name)  # once, for all copies of it
     return model
 
