@@ -413,9 +413,8 @@ class Iteration:
         predicted = promise.pull - promise.change + factor * lacking
         size = at.effort + abs(at.running) + model.charged + abs(promise.pull)
         noise, bold = tuning.noise * size, tuning.boldness * (descent + size - abs(promise.pull))
-        longest = tuning.longest if self.bold else min(tuning.longest, tuning.careful)
-        most = longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
-        alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
+        most = tuning.longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
+        alpha = math.sqrt(most / promise.length) if newton and promise.length > most else 1.0
         trials = (tuning.long_searches if fallback else tuning.searches) if newton else 1
         there = 1 - self.side
         rolled = False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 
@@ -35,8 +34,7 @@ class Tuning(NamedTuple):
         falls_back: whether there is a convex model to fall back to.
         patience: of Newton's steps in a row, none shorter than half the shortest before them: then
             they go round in circles, and shift and renewal are made to shorten them.
-        longest: a step ∫ΔuᵀRΔu dt at most, relative to the effort, or the guess's if larger.
-        careful: the same once bold steps have led nowhere.
+        longest: a judged step ∫ΔuᵀRΔu dt at most, relative to the effort, or the guess's if larger.
         boldness: bold steps end where the merit rises by so many times the cost.
         renewal: how much of a change of the rows' weights an iteration takes over, in (0, 1].
         least_renewal: how far it falls when steps go round in circles.
@@ -73,8 +71,7 @@ class Tuning(NamedTuple):
     rejections: int = 3
     falls_back: bool = True
     patience: int = 8
-    longest: float = math.inf
-    careful: float = 0.3
+    longest: float = 0.3
     boldness: float = 2.0
     renewal: float = 0.5
     least_renewal: float = 0.05
