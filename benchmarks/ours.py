@@ -21,7 +21,7 @@ from slipcar.planner import Plan, Status, plan
 from slipcar.planner.convex.solvers.registry import make_solver
 
 #: `plan`'s default, and one for answers as exact as those of the whole-problem solvers.
-DEFAULT_TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-6
+DEFAULT_TOLERANCE, FINE_TOLERANCE = 1e-4, 1e-8
 #: Names of rows that plan for a problem never met before, each time, and what some of them solve.
 UNMET = ("slipcar, a new", "slipcar, another", "slipcar, plan_batch of new")
 RANDOM_WORLDS = "random worlds"
@@ -146,7 +146,7 @@ def planner(
     options |= {"variance_weight": weight, "tolerance": tolerance}
     return Contender(
         name=f"{name}, w = {weight:g}",
-        tolerance=f"step {tolerance:.0e}",
+        tolerance=f"residual² {tolerance:.0e}",
         solve=stopwatch(lambda: plan(scenario, **options), _answer),
         solves=EXACT if weight == 0.0 else f"with {weight:g} ∫ tr Σ dt in the cost",
     )

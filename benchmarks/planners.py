@@ -44,8 +44,8 @@ a warm process. `u*` is the optimum that IPOPT finds at a tolerance of 1e-10.
   each call. The time is that of the whole call over their number, Python's share included: checks,
   guesses, iterations, `Plan` objects.
 
-A *step* tolerance is one on ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt, a *KKT* tolerance the
-solver's own.
+A *residual²* tolerance is one on the square of the maximum principle's relative residual, a *step*
+tolerance one on ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt, a *KKT* tolerance the solver's own.
 """
 
 #: Rows that owe nothing to another solver.

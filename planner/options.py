@@ -31,10 +31,13 @@ class Options:
             sub-problems. `"auto"` takes the first unless an option or the problem asks for the
             second: another solver, a trust region, the literal linearisation, a terminal box, a
             ball of controls. Where the first does not converge, the second goes on.
-        tolerance: stop when ∫ ‖u_{k+1} − u_k‖² + ‖u_k − u_{k−1}‖² dt falls to it, > 0; in the
-            units of the controls: choose it for controls that are not of order one.
+        tolerance: stop when the square of the maximum principle's relative residual falls to it,
+            > 0: of how far u is from argmax_U H beside the controls' own size, in the norm of R.
+            The dynamics then hold to 5e-5 and the terminal condition to 1e-6 of how far the states
+            in them move, and to less in proportion for tolerances below the default. No units
+            matter; :mod:`slipcar.planner.extremal.certificate` measures the same.
         max_iterations: at most so many sub-problems from each guess, ≥ 1; of those beyond 60
-            three quarters are for the convex method, should Newton's not converge.
+            half are kept for a second run and for the convex method, should the first not converge.
         trust_region: of the convex method: `"adaptive"` (None is), `"paper"` (Δ₀ = 100, × 0.99)
             or `"none"`.
         linearization: `"composite"` keeps max(0, ·)² and linearises its argument; `"literal"`

@@ -169,9 +169,21 @@ def plan_of(outcome: Outcome, model: Model, problem: Problem, **others: Any) -> 
         history=outcome.history,
         gains=None,
         problem=problem,
-        message=outcome.message,
+        message="; ".join(filter(None, (outcome.message, _through(outcome, model)))),
         **others,
     )
+
+
+def _through(outcome: Outcome, model: Model) -> str:
+    """What a converged mean runs through, in words: penalties allow what constraints forbid."""
+    if not (outcome.status.ok and model.has("constraint")):
+        return ""
+    t, x = model.times[1:], outcome.x[1:]
+    c = np.asarray(model.problem.constraint(t, x))  # type: ignore[attr-defined]
+    if not c.size or not (worst := c.max()) > 0.0:
+        return ""
+    k, row = np.unravel_index(c.argmax(), c.shape)
+    return f"the mean violates constraint[{row}] by {worst:.3g} at t = {t[k]:.4g}"
 
 
 def fields_of(

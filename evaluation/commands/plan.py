@@ -20,8 +20,8 @@ def plan(
     method: Literal["auto", "newton", "convex"] = "auto",
     compiled: Literal["auto", "yes", "no"] = "auto",
     integrator: Literal["euler", "rk4"] = "euler",
-    tolerance: float = 1e-3,
-    max_iterations: int = 100,
+    tolerance: float = 1e-4,
+    max_iterations: int = 200,
     shooting: bool = False,
     free_final_time: bool = False,
     time_weight: float = 1.0,
@@ -76,8 +76,7 @@ def plan(
             that is possible; yes says what is in the way, if anything; no takes the same steps in
             NumPy, a few hundred times slower.
         integrator: of the mean; euler is the paper's.
-        tolerance: stop when the squared change of the controls over two iterations, integrated
-            over time, falls below this.
+        tolerance: stop when the square of the maximum principle's relative residual falls to this.
         max_iterations: give up after so many.
         shooting: end the convex method by Newton's method on the maximum principle, to 1e-12.
         free_final_time: choose the horizon too; a table tells which were tried.

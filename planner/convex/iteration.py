@@ -69,7 +69,10 @@ def iterate(
     options = dataclasses.replace(options, max_iterations=left)
     careful = _Attempt(model, solver, cautious, options, x, u).run()
     off_careful, off_bold = (
-        max(feasibility.inconsistency(at), feasibility.lacks(at, options.terminal_tolerance).max())
+        max(
+            feasibility.inconsistency(at),
+            feasibility.lacks(at, options.terminal_tolerance).max(initial=0.0),
+        )
         for at in (linearize(model, end.x, end.u) for end in (careful, bold))
     )
     better = careful.status in (Status.CONVERGED, Status.STOPPED) or off_careful < off_bold
@@ -188,7 +191,9 @@ class _Attempt:
         e = model.dt[:, None] * solution.e
         step, length = float(np.vdot(e, solution.e)), float(np.vdot(e @ model.R, solution.e))
         lin = self.at.lin
-        short = feasibility.lacks(lin, options.terminal_tolerance, lin.g + lin.G @ d[-1]).max()
+        short = feasibility.lacks(lin, options.terminal_tolerance, lin.g + lin.G @ d[-1]).max(
+            initial=0.0
+        )
         lacking = sub.virtual_control(d)
         return _Proposal(solution, lacking, radius, multiplier, step, length, float(short))
 
@@ -266,7 +271,7 @@ class _Attempt:
         if not feasibility.inconsistency(lin) <= _CONSISTENCY:
             return None
         if feasible:
-            met = feasibility.lacks(lin, tau).max() <= feasibility.FEASIBILITY
+            met = feasibility.lacks(lin, tau).max(initial=0.0) <= feasibility.FEASIBILITY
             return Status.CONVERGED if met else None
         beyond = float(np.maximum(np.abs(lin.g) - tau, 0.0).sum())
         if not abs(beyond - lacking) <= _CONSISTENCY * lacking:

@@ -72,10 +72,18 @@ class Conditions:
         rest[-1] += terminal @ lin.G
         control = sub.admissible(sub.wanted(np.zeros_like(u), slope))
         end = lin.g - np.clip(self._pressed(lin.g, terminal), -self.tolerance, self.tolerance)
-        scaled = (lin.defect / scales.state, end / scales.end, rest / scales.adjoint)
-        parts = np.concatenate([part.ravel() for part in (*scaled, control / scales.control)])
-        norm = float(np.linalg.norm(parts))
-        largest = float(np.max(np.abs(parts))) if np.isfinite(norm) else np.inf
+        gap, rest_off = lin.defect / scales.state, rest / scales.adjoint
+        end_off, off = end / scales.end, control / scales.control
+        norm = float(
+            np.linalg.norm(np.concatenate([p.ravel() for p in (gap, rest_off, end_off, off)]))
+        )
+        worst = (
+            np.abs(gap).sum(axis=0),
+            np.abs(rest_off),
+            np.abs(end_off),
+            np.linalg.norm(off, axis=1),
+        )
+        largest = max(float(np.max(w, initial=0.0)) for w in worst) if np.isfinite(norm) else np.inf
         return ShootingPoint(gradients, adjoint, terminal, rest, slope, norm, largest)
 
     def moved(self, here: ShootingPoint, step: PrimalDual, length: float) -> ShootingPoint:

@@ -86,15 +86,15 @@ def terminal_multiplier(V: Array, g: Array, softness: Any) -> tuple[Array, Any]:
     bad: Any = 0.0
     y: list[Any] = []
     for i in range(t):
-        for j in range(i + 1):
-            value = W[i, j] - L[i, :j].dot(L[j, :j]) if j else W[i, j]
-            if i == j:
-                value = value + softness * W[i, i]
-                bad = bad + choose(value, 0.0, 1.0)
-                L[i, i] = np.sqrt(value)
-            else:
-                L[i, j] = value / L[j, j]
-        y.append((s[i] - sum(L[i, j] * y[j] for j in range(i))) / L[i, i])
+        for j in range(i):
+            L[i, j] = (W[i, j] - L[i, :j].dot(L[j, :j])) / L[j, j]
+        rest = s[i] - sum(L[i, j] * y[j] for j in range(i))
+        pivot = W[i, i] - L[i, :i].dot(L[i, :i]) + softness * W[i, i]
+        # What cannot be moved need not be, if it is where it must be.
+        pivot = choose(pivot, pivot, choose(magnitude(rest), pivot, 1.0))
+        bad = bad + choose(pivot, 0.0, 1.0)
+        L[i, i] = np.sqrt(pivot)
+        y.append(rest / L[i, i])
     nu = np.array(y, dtype=W.dtype)
     for i in range(t - 1, -1, -1):
         nu[i] = (y[i] - sum(L[j, i] * nu[j] for j in range(i + 1, t))) / L[i, i]

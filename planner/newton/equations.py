@@ -118,6 +118,8 @@ class Promise(NamedTuple):
         gap: Σ |λᵀf| there.
         miss: |νᵀg| there.
         changed: bounds that are passed and were not held, or the other way round.
+        unseen: what hinges cost after the step that are off in the model.
+        turned: hinges that are on after the step and off in the model, or the other way round.
         total: Σ λ: finite if all are.
     """
 
@@ -130,6 +132,8 @@ class Promise(NamedTuple):
     gap: float
     miss: float
     changed: float
+    unseen: float
+    turned: float
     total: float
 
 
@@ -179,21 +183,24 @@ def layout(dims: Dimensions, form: Form, own: Layout, second: Layout) -> Layout:
     n, m, p, q = dims.n, dims.m, dims.p, dims.q
     exact = 0 if form.soft else q
     size = n + 1 + exact
+    hinges = {} if form.noisy else {"on": Field((p,))}
     point = {
         "x": Field((n,)), "u": Field((m,)), "A": Field((n, n)), "B": Field((n, m)),
         "f": Field((n,)), "c": Field((p,)), "C": Field((p, n)), "g": Field((q,), True),
         "G": Field((q, n), True), "lam": Field((n,)), "nu": Field((q,), True),
-        "H_xx": Field((n, n)), **own,
+        "H_xx": Field((n, n)), **hinges, **own,
     }  # fmt: skip
     fields = {
         "number": Field((dims.numbers,), True), "knob": Field((len(KNOBS),), True),
-        "R": Field((m, m), True), "R_inverse": Field((m, m), True), "weight": Field((p,), True),
+        "R": Field((m, m), True), "weight": Field((p,), True),
         "t": Field(()), "dt": Field(()), "dn": Field(()), "lower": Field((m,)),
         "upper": Field((m,)), **point, **{name + NEW: field for name, field in point.items()},
         "d": Field((n,)), "e": Field((m,)), "held": Field((m,)), "passed": Field((m,)),
+        **({} if form.noisy else {"pushed": Field((p,))}),
         "V": Field((n * (n + 1) // 2 + n * (size - n),)), "law": Field((m, size)),
         "Q": Field((n, n)), "q": Field((n,)), "Rk": Field((m, m)), "rk": Field((m,)),
-        "S": Field((m, n)), "costate": Field((n,)), "P": Field((n, n)), "Sigma": Field((n, n)), "H_psd": Field((n, n)),
+        "S": Field((m, n)), "costate": Field((n,)), "P": Field((n, n)), "Sigma": Field((n, n)),
+        "H_psd": Field((n, n)),
         "evaluated": Field((len(Evaluation._fields),), True),
         "modelled": Field((len(Model._fields),), True),
         "promised": Field((len(Promise._fields),), True),
@@ -249,6 +256,7 @@ class Equations:
     def _evaluate(self, rows: Rows, carried: Carried) -> Carried:
         p, dt, u = self.problem.at(rows), rows["dt"], rows["u"]
         effort, running, charged, pull, gap, defect, penalty = carried["sums"]
+        self._switch(rows, p.c)
         f = p.next - rows.ahead("x")
         for name, value in (("f", f), ("A", p.A), ("B", p.B), ("c", p.c), ("C", p.C)):
             rows.write(name, value)
@@ -270,6 +278,7 @@ class Equations:
     def _evaluate_end(self, rows: Rows, carried: Carried) -> None:
         p = self.problem.at(rows)
         effort, running, charged, pull, gap, defect, penalty = carried["sums"]
+        self._switch(rows, p.c)
         for name, value in (("c", p.c), ("C", p.C), ("g", p.g), ("G", p.G)):
             rows.write(name, value)
         if p.state_cost:
@@ -288,6 +297,11 @@ class Equations:
             miss=miss, defect=defect, residual=residual, penalty=penalty + mean_cost,
         )  # fmt: skip
         rows.write("evaluated", np.array(evaluation, dtype=object))
+
+    def _switch(self, rows: Rows, c: Array) -> None:
+        """Certain rows c (p,) are on in the model where they cost something."""
+        if not self.form.noisy:
+            rows.write("on", choose(c, 1.0 + 0.0 * c, 0.0 * c))
 
     def _detour(self, rows: Rows, f: Array) -> Any:
         """What a defect f (n,) costs: the root mean square of λᵀf over the λ of the last step."""
@@ -339,7 +353,10 @@ class Equations:
         """With the hinges that are on, where rows are certain."""
         if self.form.noisy:
             return Q, q
-        return self._with_rows(Q, q, loss.scaled(self._knob(rows, "hinges")), rows["C"])
+        bend = (2.0 * self._knob(rows, "hinges") * rows["dn"]) * rows["weight"] * rows["on"]
+        return self._with_rows(
+            Q, q, loss._replace(slope=bend * rows["c"], curvature=bend), rows["C"]
+        )
 
     def _last(self, rows: Rows) -> Carried:
         rows.write("price", rows["priced"])
@@ -417,12 +434,15 @@ class Equations:
     def _forward_start(self, rows: Rows) -> Carried:
         n = self.dims.n
         return {
-            "d": np.zeros(n), "prices": Symmetric(np.zeros((n, n))), "sums": np.zeros(10),
+            "d": np.zeros(n), "prices": Symmetric(np.zeros((n, n))), "sums": np.zeros(12),
         }  # fmt: skip
 
     def _forward(self, rows: Rows, carried: Carried) -> Carried:
         d, u, f, dt = carried["d"], rows["u"], rows["f"], rows["dt"]
-        change, slope, step, length, radius, pull, gap, changed, total, time = carried["sums"]
+        change, slope, step, length, radius, pull, gap, changed, unseen, turned, total, time = (
+            carried["sums"]
+        )
+        more, others = self._crossed(rows, d)
         nu = rows["nu_new"][:0] if self.form.soft else rows["nu_new"]
         free = riccati.respond(rows["law"], d, nu)
         above, below = u + free - rows["upper"], rows["lower"] - u - free
@@ -446,6 +466,8 @@ class Equations:
             pull + charge,
             gap + self._detour(rows, f) + magnitude(charge),
             changed + np.sum(magnitude(passed - rows["held"])),
+            unseen + more,
+            turned + others,
             total + np.sum(lam),
             time + dt,
         ]
@@ -454,7 +476,10 @@ class Equations:
 
     def _forward_end(self, rows: Rows, carried: Carried) -> None:
         d, g = carried["d"], rows["g"]
-        change, slope, step, length, radius, pull, gap, changed, total, time = carried["sums"]
+        change, slope, step, length, radius, pull, gap, changed, unseen, turned, total, time = (
+            carried["sums"]
+        )
+        more, others = self._crossed(rows, d)
         rows.write("d", d)
         rows.write("priced", carried["prices"] / time)
         miss: Any = 0.0
@@ -463,7 +488,8 @@ class Equations:
             miss = magnitude(rows["nu_new"]).dot(magnitude(g))
         promise = Promise(
             change + self._node_change(rows, d), slope + self._node_slope(rows, d), step, length,
-            radius + rows["dn"] * d.dot(d), pull, gap, miss, changed, total,
+            radius + rows["dn"] * d.dot(d), pull, gap, miss, changed, unseen + more,
+            turned + others, total,
         )  # fmt: skip
         rows.write("promised", np.array(promise, dtype=object))
 
@@ -483,6 +509,17 @@ class Equations:
             after, before = positive_part(c + rows["C"].dot(d)), positive_part(c)
             value = value + weight.dot(after * after - before * before)
         return value
+
+    def _crossed(self, rows: Rows, d: Array) -> tuple[Any, Any]:
+        """Hinges after a step d: what those cost that the model has off, and how many differ."""
+        if self.form.noisy or not self.dims.p:
+            return 0.0, 0.0
+        after, on = rows["c"] + rows["C"].dot(d), rows["on"]
+        there = choose(rows["dn"], choose(after, 1.0 + 0.0 * after, 0.0 * after), on)
+        rows.write("pushed", there)
+        pushed = positive_part(after)
+        weight = (rows["weight"] * rows["dn"]) * (1.0 - on)
+        return weight.dot(pushed * pushed), np.sum(magnitude(there - on))
 
     def _node_slope(self, rows: Rows, d: Array) -> Any:
         """How a node's costs change with the first part of a step d."""

@@ -10,16 +10,19 @@ Each iteration solves one quadratic model, cut down to what is smooth at the ite
 * without a better guess, rows are left out at first, until steps are short: which way round the
   obstacles is then decided by where the free path runs, not by where the guess did;
 * at first the model is that of the paper's convex sub-problem. Whole steps are taken: bold ones
-  are what finds a way. When they are no longer than the controls, or after some number of them,
-  the curvature of dynamics, rows and terminal condition is added, weighed by the multipliers:
-  Newton's method on the optimality conditions, quadratic at the end (with noise charged, whose
-  weights P are held in a step, linear with a factor of some hundredths to tenths);
+  are what finds a way. When they are no longer than the controls, or after some number of them, or
+  where they lead nowhere, the curvature of dynamics, rows and terminal condition is added, weighed
+  by the multipliers: Newton's method on the optimality conditions, quadratic at the end (with noise
+  charged, whose weights P are held in a step, linear with a factor of some hundredths to tenths);
 * where the model is then not convex in the controls (a pivot of the Riccati recursion is not
-  positive), a multiple of the identity is added: a trust region by its multiplier, −p¹ of the
-  paper. A line search on a merit function makes it descend;
+  positive) or along its step, a multiple of R is added: a trust region by its multiplier, −p¹ of
+  the paper. Where that is not enough, the curvature is taken back towards the convex model;
+* a line search on a merit function makes it descend: the linear step first, then roll-outs of its
+  law, which follow the dynamics and so have no defects but what is left of the old ones;
 * after a few rejected steps in a row the convex model's step, searched further, goes first;
-* steps that no longer become shorter go round in circles: then the multiple of the identity is kept
-  from vanishing.
+* steps that no longer become shorter, and do not what the model says, go round in circles: then
+  the multiple of R is kept from vanishing;
+* it ends where the residual of the maximum principle, measured anew at the iterate, is small.
 
 Plans that count the noise start from a plan of the mean, with curvature from the first step on.
 After each step the belief follows: covariance, rows' spread, weights P and gains K
@@ -199,7 +202,6 @@ class Iteration:
             return Ending(None, 0, 0, self.at)
         self._believe(fresh=not task.warm)
         self._backward[0]()  # with kappa zero: how far the last controls move the end
-        self._forward[0]()  # and what defects cost
         self._knobs[_KAPPA] = tuning.terminal_curvature
         self._first_effort = self.at.effort
         status = self._iterate()
@@ -231,11 +233,11 @@ class Iteration:
                 self._confine()
             self._prepare(curved)
             linearized = time.perf_counter()
-            step = self._step(curved, released)
+            step = self._step(newton, curved, released)
             if step is None:
                 return Status.SOLVER_FAILED
             solved = time.perf_counter()
-            trial = self._search(step, newton, fallback)
+            trial = self._search(step, newton, fallback, released)
             self.tried += 1
             shift, there, status = self.shift if curved else 0.0, 1 - self.side, None
             if trial.accepted:
@@ -328,7 +330,7 @@ class Iteration:
 
     # ------------------------------------------------------------------------------- the step
 
-    def _step(self, curved: bool, released: bool) -> _Step | None:
+    def _step(self, newton: bool, curved: bool, released: bool) -> _Step | None:
         """The model's step: bounds settle, and the shift grows until the model is convex."""
         knobs, tuning = self._knobs, self.tuning
         knobs[_HINGES] = 0.0 if released else 1.0
@@ -336,7 +338,7 @@ class Iteration:
         for _ in range(tuning.inertia_trials):
             knobs[_DAMPING] = self.shift if curved else 0.0
             knobs[_CURVED] = self.curvature if curved else 0.0
-            model, promise, rounds = self._settle_bounds()
+            model, promise, rounds = self._settle(newton)
             solves += rounds
             if promise is not None and not (
                 self.curvature > 0.0
@@ -356,11 +358,16 @@ class Iteration:
                     self.curvature = 0.0
         return None
 
-    def _settle_bounds(self) -> tuple[Model, Promise | None, int]:
-        """Solve the LQ problem until the bounds it passes are those it was solved with."""
-        ws, rounds = self.workspace, self.tuning.bound_rounds
+    def _settle(self, newton: bool) -> tuple[Model, Promise | None, int]:
+        """Solve the LQ problem until bounds, and hinges that matter, are those it was solved with.
+
+        Bold steps go through hinges that are off; judged ones see those that would cost as much
+        as the step gains.
+        """
+        ws, tuning, arrays = self.workspace, self.tuning, self.workspace.arrays
         backward, forward = self._backward[self.side], self._forward[self.side]
-        for attempt in range(1, rounds + 1):
+        kept = None
+        for attempt in range(1, tuning.bound_rounds + 1):
             backward()
             model: Model = ws.model()
             if model.bad != 0.0:
@@ -369,27 +376,43 @@ class Iteration:
             promise: Promise = ws.promise()
             if not math.isfinite(promise.total):
                 return model, None, attempt
-            if promise.changed == 0.0:
+            turned = (
+                newton
+                and promise.turned != 0.0
+                and (
+                    kept is not None
+                    or promise.unseen > tuning.unseen * abs(promise.pull - promise.slope)
+                )
+            )
+            if promise.changed == 0.0 and not turned:
                 return model, promise, attempt
-            if attempt < rounds:
-                ws.arrays["held"][:] = ws.arrays["passed"]
+            if attempt < tuning.bound_rounds:
+                arrays["held"][:] = arrays["passed"]
+                if turned:
+                    on = ws.at(self.side, "on")
+                    kept = on.copy() if kept is None else kept
+                    on[:] = arrays["pushed"]
+        if kept is not None:  # hinges do not settle: those of the iterate
+            ws.at(self.side, "on")[:] = kept
+            backward()
+            model = ws.model()
         # The set does not settle: clip the controls and let the states follow.
         self._knobs[_CLIPPED] = 1.0
         forward()
         self._knobs[_CLIPPED] = 0.0
-        return model, ws.promise(), rounds
+        return model, ws.promise(), attempt
 
-    def _search(self, step: _Step, newton: bool, fallback: bool) -> _Trial:
+    def _search(self, step: _Step, newton: bool, fallback: bool, released: bool) -> _Trial:
         """Shorten the step until the merit function falls; free steps are taken whole."""
         model, promise, tuning, at = step.model, step.promise, self.tuning, self.at
-        lacking = 1.0 * (promise.gap + promise.miss)
+        lacking = promise.gap + promise.miss
         descent = promise.pull - promise.slope
         factor = max(1.0, -descent / (0.75 * lacking)) if lacking > 0.0 else 1.0
         descent += factor * lacking
         before = at.effort + at.running + model.charged + promise.pull + factor * lacking
         predicted = promise.pull - promise.change + factor * lacking
         size = at.effort + abs(at.running) + model.charged + abs(promise.pull)
-        noise = tuning.noise * size
+        noise, bold = tuning.noise * size, tuning.boldness * (descent + size - abs(promise.pull))
         longest = tuning.longest if self.bold else min(tuning.longest, tuning.careful)
         most = longest * (max(self._first_effort, at.effort) + 1e-3 * promise.length)
         alpha = math.sqrt(most / promise.length) if promise.length > most else 1.0
@@ -404,10 +427,11 @@ class Iteration:
                 self._shift[self.side]()
             new = self._evaluated(there)
             merit = new.effort + new.running + new.charged + new.pull
-            merit += factor * 1.0 * (new.gap + new.miss)
+            merit += factor * (new.gap + new.miss)
             actual = before - merit
+            unseen = new.charged - model.charged if released else 0.0
             accepted = math.isfinite(merit) and (
-                (not newton and actual >= -tuning.boldness * (descent + size - abs(promise.pull)))
+                (not newton and actual + unseen >= -bold)
                 or (descent <= noise and actual >= -noise)
                 or actual >= tuning.armijo * alpha * descent
             )
@@ -417,10 +441,20 @@ class Iteration:
                 alpha *= 0.5
             rolled = True
         square = alpha * alpha
+        moved, length = square * promise.step, square * promise.length
+        if rolled:
+            moved, length = self._moved(there)
         return _Trial(
-            new, alpha, accepted, merit, predicted, actual, noise, square * promise.step,
-            square * promise.length, square * promise.radius,
+            new, alpha, accepted, merit, predicted, actual, noise, moved, length,
+            square * promise.radius,
         )  # fmt: skip
+
+    def _moved(self, there: int) -> tuple[float, float]:
+        """∫ ‖Δu‖² dt and ∫ ΔuᵀRΔu dt from the iterate to a candidate that was rolled out."""
+        ws = self.workspace
+        moved = (ws.at(there, "u") - ws.at(self.side, "u"))[:-1]
+        weighted = ws.arrays["dt"][:-1] * moved
+        return float(np.vdot(weighted, moved)), float(np.vdot(weighted @ ws.at(0, "R")[0], moved))
 
     # -------------------------------------------------------------------------- what follows
 
@@ -474,16 +508,23 @@ class Iteration:
     def _extremal(self) -> bool:
         """Whether the iterate meets the maximum principle, its dynamics and its end."""
         at = self.at
-        if at.gap + at.miss > self.tuning.defective * (abs(at.effort) + abs(at.running)):
+        tuning, cost = self.tuning, at.effort + abs(at.running)
+        off = at.gap + at.miss
+        if off > tuning.defective * cost or (
+            self.length > tuning.long * at.effort and off > 1e-6 * cost
+        ):
             return False  # not worth a closer look
-        tuning = self.tuning
         for answered in (0.0, 1.0):
             self._knobs[_ANSWERED] = answered
             self.workspace.kernels["residuals"][self.side]()
             off = self.workspace.residuals()
-            if not (off.gap <= tuning.consistency and off.end <= tuning.feasibility):
+            strict = max(tuning.strictest, min(1.0, 1e4 * self.task.tolerance))
+            if not (
+                off.gap <= tuning.consistency * strict and off.end <= tuning.feasibility * strict
+            ):
                 return False
-            if off.control <= self.task.tolerance:
+            # An adjoint that depends on a feedback is only as good as what it leaves.
+            if off.control <= self.task.tolerance * (0.01 if answered else 1.0):
                 return True
             if self.length > 1e-8 * self.task.tolerance * at.effort:
                 return False

@@ -134,7 +134,7 @@ def _assembly(problem: Any, recursions: Mapping[str, Recursion], fields: Layout)
 def _estimate(dims: Dimensions) -> str:
     """What to say before a compilation that takes longer than a second; empty otherwise."""
     size = dims.n + dims.m + dims.q
-    seconds = 4e-5 * size**3
+    seconds = 1e-5 * size**3
     if seconds < 1.0:
         return ""
     return f"compiling for {dims.n} states and {dims.m} controls, some {seconds:.0f} s (once) ..."

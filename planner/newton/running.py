@@ -47,7 +47,6 @@ def load(workspace: Workspace, posed: Posed, weight: Array, x: Array, u: Array) 
     arrays, model, K = workspace.arrays, posed.model, workspace.K
     arrays["number"][0] = posed.numbers
     arrays["R"][0] = model.R.ravel()
-    arrays["R_inverse"][0] = model.R_inverse.ravel()
     arrays["weight"][0] = weight
     arrays["t"][:, 0] = model.times
     arrays["dt"][:K, 0] = model.dt

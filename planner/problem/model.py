@@ -32,6 +32,12 @@ _NUMBERS = (
 _OPTIONAL = ("penalty", "constraint", "state_cost", "control_cost")
 
 
+#: Gauss–Newton steps to an end that the terminal condition allows.
+_END_STEPS = 10
+#: A path explodes that gets so many times as far in its second half as in its first.
+_EXPLODES = 1e3
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Model:
     """A problem, checked and completed: what the planner computes with.
@@ -83,21 +89,6 @@ class Model:
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @functools.cached_property
-    def R_inverse(self) -> Array:  # noqa: N802
-        """R⁻¹, (m, m)."""
-        return np.linalg.inv(self.R)
-
-    @functools.cached_property
-    def unit(self) -> float:
-        """The largest diagonal entry of R: the scale of what is added to Hessians."""
-        return float(self.R.diagonal().max())
-
-    @functools.cached_property
-    def longest_dt(self) -> float:
-        """The longest interval [s]."""
-        return float(self.dt.max())
-
-    @functools.cached_property
     def jacobians(self) -> Jacobians:
         """Derivatives of the functions as they are now."""
         return Jacobians(self.problem, self.state_dim, self.control_dim)
@@ -118,7 +109,7 @@ class Model:
         return project_controls(u, self.lower, self.upper, self.radius)
 
     def guess(self) -> tuple[Array, Array]:
-        """The problem's own, else the uncontrolled path, else (it escapes) resting at the start."""
+        """The problem's own, else the uncontrolled path, else (it explodes) a line to the end."""
         own = self.own_guess or getattr(self.problem, "initial_guess", None)
         return checked_trajectory(self, *(own() if own is not None else self._uncontrolled()))
 
@@ -137,9 +128,22 @@ class Model:
                         f"{np.shape(moved)}"
                     )
                 x[k + 1] = x[k] + moved
-        if not np.isfinite(x).all():
-            x[:] = self.start
-        return x, u
+        return (x if _tame(x) else self._line()), u
+
+    def _line(self) -> Array:
+        """A straight way from the start to the nearest end that the terminal condition allows."""
+        end = self.start
+        with np.errstate(all="ignore"):
+            for _ in range(_END_STEPS):
+                at = end[None]
+                g, G = self.terminal(at)[0], self.terminal_jacobian(at)[0]
+                if not np.any(g) or not (np.isfinite(g).all() and np.isfinite(G).all()):
+                    break
+                end = end - np.linalg.lstsq(G, g, rcond=None)[0]
+        if not np.isfinite(end).all():
+            end = self.start
+        s = (self.times - self.times[0]) / (self.times[-1] - self.times[0])
+        return self.start + s[:, None] * (end - self.start)
 
     # ----------------------------------------------------------- functions of times and states
 
@@ -210,6 +214,15 @@ class Model:
     def control_cost_jacobian(self, t: Array, x: Array) -> Array:
         """∂ℓ/∂x, (..., m, n)."""
         return self.jacobians.state("control_cost", t, x)
+
+
+def _tame(x: Array) -> bool:
+    """Whether a path (N, n) is finite and does not explode."""
+    if not np.isfinite(x).all():
+        return False
+    far = np.abs(x - x[0])
+    early, late = far[: len(x) // 2 + 1].max(axis=0), far.max(axis=0)
+    return not bool(np.any((early > 0.0) & (late > _EXPLODES * early)))
 
 
 def penalty_cost(model: Model, x: Array) -> float:
@@ -305,7 +318,7 @@ def _checked(problem: Any) -> Model:
         radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
         weight=_checked_penalties(problem, times[:2], start, len(R)),
     )
-    for name in ("state_dim", "control_dim", "bounded", "R_inverse", "unit", "longest_dt"):
+    for name in ("state_dim", "control_dim", "bounded"):
         getattr(model, name)  # once, for all copies of it
     return model
 

@@ -141,7 +141,7 @@ def _joined(ended: list[Outcome], count: int | None = None) -> Outcome:
 def _off(model: Model, options: Options, outcome: Outcome) -> float:
     """How far an outcome is from feasible, relative to how far its states move."""
     at = linearize(model, outcome.x, outcome.u)
-    off = max(inconsistency(at), float(lacks(at, options.terminal_tolerance).max()))
+    off = max(inconsistency(at), float(lacks(at, options.terminal_tolerance).max(initial=0.0)))
     return off if np.isfinite(off) and np.isfinite(outcome.objective) else np.inf
 
 

@@ -38,7 +38,7 @@ _FIRST_RADIUS, _LARGEST_RADIUS, _SHRINK, _GROW = 0.2, 0.5, 0.25, 2.0
 #: relative to the mean cost per time; give up after so many plans.
 _SHORTEST, _TRANSVERSALITY, _PLANS = 1e-9, 1e-9, 40
 #: Tolerance of the plans: the slope is only as good as the plan it is taken at.
-_PRECISE = 1e-12
+_PRECISE = 1e-16
 #: Relative accuracy of V + c T: below it the slope decides.
 _NOISE = 1e-7
 #: How much longer the horizon becomes where none was planned yet.

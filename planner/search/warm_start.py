@@ -77,7 +77,7 @@ def run_guarded(
 
     def off(x: Array, u: Array) -> float:
         at = linearize(model, x, u)
-        return max(inconsistency(at), float(lacks(at, options.terminal_tolerance).max()))
+        return max(inconsistency(at), float(lacks(at, options.terminal_tolerance).max(initial=0.0)))
 
     warm, own = run(*guess), model.guess()
     same = all(np.array_equal(a, b) for a, b in zip(guess, own, strict=True))

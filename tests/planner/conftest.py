@@ -30,7 +30,7 @@ def paper():
 @pytest.fixture(scope="session")
 def exact_paper_plan(paper):
     """Deterministic SCP on the paper's case to the last digit."""
-    return plan(paper, variance_weight=0.0, tolerance=1e-10)
+    return plan(paper, variance_weight=0.0, tolerance=1e-16)
 
 
 def _rollout(problem, controls):

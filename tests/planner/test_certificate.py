@@ -132,7 +132,7 @@ def test_the_adjoint_is_the_gradient_of_cost_and_terminal_condition(paper, rollo
         return lin.effort + lin.penalty + nu @ lin.g
 
     at = first_order(model, rollout(paper, u), u, 0.0)
-    slope = np.vdot(at.sub.slope(adjoint_of(at, nu)), direction)
+    slope = np.vdot(at.sub.slope(adjoint_of(model, at, nu)), direction)
     h = 1e-6
     change = (lagrangian(u + h * direction) - lagrangian(u - h * direction)) / (2.0 * h)
     assert slope == pytest.approx(change, rel=1e-7)
@@ -163,7 +163,7 @@ def test_held_part_and_the_rest_are_the_whole_gradient_of_the_variance(paper, so
 
 def test_what_holding_lambda_leaves_out_is_small_on_the_paper_case(paper, tight):
     at = first_order(model_of(paper), tight.mean, tight.controls, 1.0)
-    adjoint = adjoint_of(at, -tight.multipliers.terminal)
+    adjoint = adjoint_of(model_of(paper), at, -tight.multipliers.terminal)
     A_x = second_order(model_of(paper), at, adjoint, np.zeros(5), 1.0).A_x
     left_out = held_variance_gradient(at, A_x, tight.covariance, 1.0)
     assert 0.0 < np.max(np.abs(left_out)) < 1e-4 * np.max(np.abs(adjoint))

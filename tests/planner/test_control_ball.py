@@ -163,7 +163,7 @@ def test_the_cases_have_balls_at_work_and_at_rest(met):
 
 
 def test_a_ball_that_nothing_touches_changes_nothing():
-    a, b = plan(Ship(None, wind=0.7), tolerance=1e-10), plan(Ship(50.0, wind=0.7), tolerance=1e-10)
+    a, b = plan(Ship(None, wind=0.7), tolerance=1e-16), plan(Ship(50.0, wind=0.7), tolerance=1e-16)
     np.testing.assert_allclose(a.controls, b.controls, atol=1e-9)
 
 

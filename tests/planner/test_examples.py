@@ -330,7 +330,7 @@ def test_quadrotor_moments_are_those_of_the_continuous_flight():
     errors = []
     for nodes in (51, 101, 201):
         problem = on_a_grid(nodes)
-        p = plan(problem, variance_weight=10.0, integrator="rk4")
+        p = plan(problem, variance_weight=10.0, integrator="rk4", tolerance=1e-10)
         jacobian = model_of(problem).drift_jacobian
 
         def moments(t, y, u, problem=problem, jacobian=jacobian):

@@ -235,7 +235,7 @@ def test_an_end_far_out_of_reach_is_named_whatever_the_status(paper, starts):
     p = plan(paper.replace(goal=(30.0, 0.0, 0.0, 0.0, 0.0), nodes=11), starts=starts)
     assert not p.status.ok
     assert "g[0] = -" in p.message
-    assert p.iterations <= 100
+    assert p.iterations <= 200
 
 
 def test_what_is_lacking_when_iterations_run_out(paper):
