@@ -1,12 +1,13 @@
-"""The campaign: so many random inputs of every idea, all findings, exit 1 if there are any.
+"""The campaign: so many random inputs of every idea, every finding, exit 1 if there are any.
 
-cd tests && python -m fuzz --count 1000 --seed 0 --only problems worlds
+`make fuzz ARGS="--count 1000 --seed 3 --only problems"`; an input that a finding prints is tried
+again by `make fuzz ARGS="--only problems --input '(Recipe(seed=3), {})'"`.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
+import re
 import sys
 import time
 from collections import Counter
@@ -14,6 +15,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
+from . import inputs
 from .ideas import IDEAS, Idea
 
 #: Examples of a finding that are printed.
@@ -21,9 +23,9 @@ SHOWN = 2
 
 
 def run(name: str, idea: Idea, count: int, kinds: int, number: int) -> int:
-    """Try an idea; print each finding with its input when it is made; return how many inputs had any."""
-    kinds_found: Counter[str] = Counter()
-    bad, done, began = 0, 0, time.perf_counter()
+    """Try an idea; print findings with their inputs as they are made; how many inputs had any."""
+    sorts: Counter[str] = Counter()
+    bad, done, began, told = 0, 0, time.perf_counter(), time.perf_counter()
 
     @seed(number)
     @settings(
@@ -32,28 +34,31 @@ def run(name: str, idea: Idea, count: int, kinds: int, number: int) -> int:
     )  # fmt: skip
     @given(idea.inputs(kinds, number))
     def each(case: Any) -> None:
-        nonlocal bad, done
+        nonlocal bad, done, told
         begun = time.perf_counter()
         found = idea.check(case)
         done, bad = done + 1, bad + bool(found)
         for finding in found:
-            kinds_found[_sort(finding)] += 1
-            if kinds_found[_sort(finding)] <= SHOWN:
+            sorts[_sort(finding)] += 1
+            if sorts[_sort(finding)] <= SHOWN:
                 print(f"  {finding}\n    {case!r}", flush=True)
         if (took := time.perf_counter() - begun) > 10.0:
             print(f"  {took:.0f} s: {case!r}", flush=True)
+        if time.perf_counter() - told > 60.0:
+            told = time.perf_counter()
+            print(f"  ... {done} inputs, {bad} with findings, {told - began:.0f} s", flush=True)
 
     print(f"{name}:", flush=True)
     each()
     print(f"{name}: {done} inputs, {bad} with findings, {time.perf_counter() - began:.0f} s")
-    for sort, times in kinds_found.most_common():
+    for sort, times in sorts.most_common():
         print(f"  {times:5d} x {sort}", flush=True)
     return bad
 
 
 def _sort(finding: str) -> str:
     """A finding without its numbers."""
-    return "".join("#" if c.isdigit() else c for c in finding)[:60].replace("##", "#")
+    return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", finding)[:70]
 
 
 def main() -> int:
@@ -62,8 +67,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", type=int, default=120, help="structures of problems")
     parser.add_argument("--only", nargs="+", choices=sorted(IDEAS), default=sorted(IDEAS))
+    parser.add_argument("--input", help="one input of one idea, as a finding prints it")
     asked = parser.parse_args()
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if asked.input:
+        found = IDEAS[asked.only[0]].check(eval(asked.input, vars(inputs)))
+        print(*(found or ["nothing found"]), sep="\n")
+        return 1 if found else 0
     shares = sum(IDEAS[name].share for name in asked.only)
     bad = 0
     for name in asked.only:

@@ -48,6 +48,15 @@ damages = st.builds(
     value=st.sampled_from(_VALUES),
 )
 
+#: What becomes of an array in a file; None: it is gone.
+_CHANGES = (
+    lambda a: a[..., :-1] if a.ndim else a[None],
+    lambda a: np.full(a.shape, np.nan),
+    lambda a: a.astype(str),
+    lambda a: None,
+    lambda a: np.full(a.shape, 1j),
+)
+
 
 @functools.cache
 def _whole(of: str) -> tuple[bytes, Plan | None]:
@@ -82,8 +91,7 @@ def _damaged(data: bytes, damage: Damage) -> bytes:
         arrays["header"] = np.array(json.dumps(header))
     else:
         name = sorted(set(arrays) - {"header"})[at % (len(arrays) - 1)]
-        changed = {0: lambda a: a[..., :-1] if a.ndim else a[None], 1: lambda a: np.full_like(a, np.nan),
-                   2: lambda a: a.astype(str), 3: lambda a: None, 4: lambda a: a.astype(complex)}[at % 5](arrays[name])  # fmt: skip
+        changed = _CHANGES[at % len(_CHANGES)](arrays[name])
         arrays = {k: v for k, v in arrays.items() if k != name}
         if changed is not None:
             arrays[name] = changed

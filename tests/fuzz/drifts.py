@@ -1,4 +1,4 @@
-"""Closed-form drifts b(t, x, u) of order one, affine in u, by name; coefficients from a generator."""
+"""Closed-form drifts b(t, x, u) of order one, by name, with random coefficients."""
 
 from __future__ import annotations
 

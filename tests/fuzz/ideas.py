@@ -22,13 +22,14 @@ from . import damage, ipopt, judge, options, worlds
 from .calls import call
 from .problems import Own, Recipe, recipes
 
-#: Options whose numbers have units: with them, other units ask for something else.
+#: Options of the convex method: it and its solvers take a problem in the units that it has.
+_CONVEX = {"method", "solver", "trust_region", "linearization", "shooting", "terminal_tolerance"}
+#: Options whose numbers have units: in others they ask for something else.
 _DIMENSIONAL = {
-    "variance_weight", "terminal_weight", "time_weight", "risk_price", "terminal_tolerance",
+    "variance_weight", "terminal_weight", "time_weight", "risk_price", "free_final_time",
     "tolerance",
 }  # fmt: skip
-#: What `plan` says of a problem outside the class, as it should.
-_REFUSED = ("bent", "jump", "hole", "state")
+_BALLS = ("ball", "ball and box")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,13 +52,16 @@ class Idea:
 
 def problem_asked(recipe: Recipe, asked: dict[str, Any]) -> list[str]:
     """Plan a random problem and judge the plan."""
+    if set(asked) & _CONVEX:
+        recipe = recipe.plain
     problem = Own(recipe)
     called = call(lambda: plan(problem, **asked))
     found = list(called.findings)
     if called.error is None:
         found += judged(problem, called.value)
         found += _reached(problem, called.value)
-        if not (set(asked) & _DIMENSIONAL or _charges_noise(problem, called.value)):
+        unitless = not set(asked) & _DIMENSIONAL and recipe.bounds not in _BALLS
+        if unitless and not _charges_noise(problem, called.value):
             found += _same_elsewhere(recipe, asked, called.value)
     return found
 
@@ -120,9 +124,6 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     if recipe.plain == recipe:
         return []
     plain = Own(recipe.plain)
-    # A wall-clock and a line of retreat: spreads draw numbers of their own, before all others.
-    if recipe.spread:
-        return []
     other = call(lambda: plan(plain, **asked))
     if other.error is not None:
         return [f"refused where all is of order one: {other.error}"]

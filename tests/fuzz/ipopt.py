@@ -19,8 +19,8 @@ MISSING = (
 
 
 def meets(problem: Any) -> bool | None:
-    """True if IPOPT converges; None where it cannot be asked (what cannot be traced)."""
-    if MISSING:
+    """True if IPOPT converges; None where it cannot be asked (a ball, what cannot be traced)."""
+    if MISSING or getattr(problem, "control_radius", None) is not None:
         return None
     sys.path.insert(0, _FOLDER)
     try:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 #: Of the plain call most often, for that is what users make.
 TAKEN = (
-    {}, {}, {}, {}, {}, {}, {"variance_weight": 0.0}, {"variance_weight": 0.0},
+    {}, {}, {}, {}, {}, {}, {}, {}, {}, {}, {"variance_weight": 0.0}, {"variance_weight": 0.0},
     {"variance_weight": 10.0}, {"method": "newton"}, {"method": "convex"}, {"integrator": "rk4"},
     {"tolerance": 1e-8}, {"tolerance": 1e-2}, {"max_iterations": 1}, {"max_iterations": 7},
     {"starts": 3}, {"terminal_tolerance": 0.1}, {"trust_region": "paper"},
@@ -32,7 +32,8 @@ REFUSED = {
     "trust_region": [v for v in NOT_CHOICES if v is not None], "cold_start": NOT_CHOICES,
     "compiled": NOT_FLAGS, "free_first": NOT_FLAGS, "feedback": NOT_FLAGS, "expected": NOT_FLAGS,
     "risk": (0.0, 1.0, *NOT_NUMBERS[1:]), "risk_price": (True, *NOT_NUMBERS[1:]),
-    "callback": (3, "print", []), "solver": ("gurobi", 3, None), "guess": (3, "x", (1, 2), [[], []]),
+    "callback": (3, "print", []), "solver": ("gurobi", 3, None),
+    "guess": (3, "x", (1, 2), [[], []]),
     "check_derivatives": NOT_FLAGS, "shooting": NOT_FLAGS, "free_final_time": NOT_FLAGS,
 }  # fmt: skip
 

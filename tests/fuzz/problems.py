@@ -97,7 +97,7 @@ class Own:
         self._drift = drifts.drift(kind.drift, n, m, rng)
         self._rng = rng
         x_power, u_power, t_power, c_power = recipe.exponents
-        apart = rng.uniform(-3.0, 3.0, size=n).round() if recipe.spread else np.zeros(n)
+        apart = rng.uniform(-3.0, 3.0, size=n).round() * recipe.spread
         self.X, self.U = 10.0 ** (x_power + apart), 10.0**u_power
         self.T, self.C = 10.0**t_power, 10.0**c_power
         start, times = 0.5 * rng.normal(size=n), _grid(recipe.grid, K, rng)
@@ -287,7 +287,7 @@ def recipes(kinds: int, seed: int = 0, *, most_intervals: int = 200) -> st.Searc
     rng = np.random.default_rng(seed)
     pool = [Kind(), *(Kind.drawn(rng) for _ in range(kinds - 1))]
     power = st.sampled_from((0, 0, 0, -1, 1, -3, 3, -6, 6))
-    counts = [K for K in (20, 10, 5, 3, 2, 1, 40, 80, 200) if K <= most_intervals]
+    counts = [K for K in (20, 10, 5, 3, 2, 1, 40, 80, 200) if most_intervals >= K]
     return st.builds(
         Recipe,
         kind=st.sampled_from(pool),

@@ -1,0 +1,115 @@
+"""A short campaign in the suite, the same inputs each time; and that the judge can say no.
+
+`make fuzz` tries thousands, of more structures.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+
+from slipcar.planner import Plan, plan
+
+from . import judge
+from .calls import call
+from .ideas import IDEAS
+from .problems import Own, Recipe
+
+#: Inputs of each idea; problems of a few structures, for each has to be compiled.
+COUNTS = {
+    "problems": 40, "worlds": 12, "scenarios": 60, "options": 60, "files": 60, "batches": 5,
+    "receding": 4,
+}  # fmt: skip
+KINDS = 8
+
+
+@pytest.mark.parametrize("name", IDEAS)
+def test_nothing_is_wrong_with(name):
+    assert set(COUNTS) == set(IDEAS)
+
+    @settings(
+        max_examples=COUNTS[name], derandomize=True, database=None, deadline=None,
+        phases=(Phase.explicit, Phase.generate, Phase.shrink),
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(IDEAS[name].inputs(KINDS, 0))
+    def each(case):
+        assert IDEAS[name].check(case) == []
+
+    each()
+
+
+# --- the judge -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def planned():
+    problem = Own(Recipe(bounds="box"))
+    return problem, plan(problem, variance_weight=0.0, tolerance=1e-8)
+
+
+def spoiled(p: Plan, **changes) -> Plan:
+    return p.replace(**changes)
+
+
+def test_the_judge_finds_nothing_where_there_is_nothing(planned):
+    assert judge.findings(*planned) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        (lambda p: {"controls": 1.02 * p.controls, "effort": 1.0404 * p.effort}, "steps"),
+        (lambda p: {"controls": p.controls + 9.0}, "outside"),
+        (lambda p: {"effort": 1.001 * p.effort}, "add up"),
+        (lambda p: {"running_cost": 1.0}, "add up"),
+        (lambda p: {"mean": p.mean + 0.1}, "start"),
+        (lambda p: {"mean": p.mean * np.nan}, "not finite"),
+        (lambda p: {"covariance": p.covariance - np.eye(2)}, "eigenvalue"),
+    ],
+)
+def test_the_judge_finds_what_was_spoiled(planned, changes, word):
+    problem, p = planned
+    assert any(word in finding for finding in judge.findings(problem, p.replace(**changes(p))))
+
+
+def test_the_judge_tells_an_extremal_from_any_other_way_there(planned):
+    """The known path obeys everything but the maximum principle."""
+    problem, p = planned
+    u, t = problem.known, p.times
+    x = judge.rolled(problem, "euler", t, u)
+    effort = float(np.einsum("k,ki,ij,kj", np.diff(t), u, problem.control_weight, u))
+    other = p.replace(mean=x, controls=u, effort=effort)
+    assert any("no extremal" in finding for finding in judge.findings(problem, other))
+
+
+def test_the_judge_finds_a_missed_end(planned):
+    problem, p = planned
+    beyond = dataclasses.replace(p)
+    problem = Own(Recipe(bounds="box"))
+    asked = problem.terminal
+    problem.terminal = lambda x: asked(x) + 0.01
+    assert any("g[0]" in finding for finding in judge.findings(problem, beyond))
+
+
+@pytest.mark.parametrize(
+    ("function", "word"),
+    [
+        (lambda: 1 / 0, "ZeroDivisionError"),
+        (lambda: int("x"), "names no cause"),
+        (lambda: np.log(np.zeros(1)), "RuntimeWarning"),
+        (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError"),
+    ],
+)
+def test_a_call_is_judged_by_how_it_ends(function, word):
+    (finding,) = call(function).findings
+    assert word in finding
+
+
+def test_a_refusal_that_names_its_cause_is_none():
+    def refuse():
+        raise ValueError("tolerance must be > 0, not -1")
+
+    assert call(refuse).findings == ()
+    assert isinstance(call(refuse).error, ValueError)
