@@ -16,23 +16,23 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from . import inputs
-from .ideas import IDEAS, Idea
+from .ideas import IDEAS, Idea, Scope
 
 #: Examples of a finding that are printed.
 SHOWN = 2
 
 
-def run(name: str, idea: Idea, count: int, kinds: int, number: int) -> int:
+def run(name: str, idea: Idea, count: int, scope: Scope) -> int:
     """Try an idea; print findings with their inputs as they are made; how many inputs had any."""
     sorts: Counter[str] = Counter()
     bad, done, began, told = 0, 0, time.perf_counter(), time.perf_counter()
 
-    @seed(number)
+    @seed(scope.seed)
     @settings(
         max_examples=count, database=None, deadline=None, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
-    @given(idea.inputs(kinds, number))
+    @given(idea.inputs(scope))
     def each(case: Any) -> None:
         nonlocal bad, done, told
         begun = time.perf_counter()
@@ -77,7 +77,7 @@ def main() -> int:
     bad = 0
     for name in asked.only:
         count = max(1, round(asked.count * IDEAS[name].share / shares))
-        bad += run(name, IDEAS[name], count, asked.kinds, asked.seed)
+        bad += run(name, IDEAS[name], count, Scope(asked.kinds, asked.seed))
     return 1 if bad else 0
 
 

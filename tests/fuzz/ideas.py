@@ -29,7 +29,31 @@ _DIMENSIONAL = {
     "variance_weight", "terminal_weight", "time_weight", "risk_price", "free_final_time",
     "tolerance",
 }  # fmt: skip
+#: States beyond this lead to actions beyond float32.
+LARGEST = 1e30
 _BALLS = ("ball", "ball and box")
+
+
+@dataclasses.dataclass(frozen=True)
+class Scope:
+    """How wide inputs are drawn.
+
+    Attributes:
+        kinds: structures of problems: each has to be compiled.
+        seed: chooses them.
+        most_intervals: of any of their time grids.
+        asked: options of `plan`.
+    """
+
+    kinds: int = 120
+    seed: int = 0
+    most_intervals: int = 200
+    asked: st.SearchStrategy[dict[str, Any]] = options.taken
+
+    def recipes(self, kinds: int = 10**6, most_intervals: int = 10**6) -> st.SearchStrategy[Recipe]:
+        """Problems of no more kinds than these, no longer than that."""
+        longest = min(most_intervals, self.most_intervals)
+        return recipes(min(kinds, self.kinds), self.seed, most_intervals=longest)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +61,12 @@ class Idea:
     """Inputs of one sort.
 
     Attributes:
-        inputs: (kinds of problems, seed) -> strategy.
+        inputs: scope -> strategy.
         check: an input -> findings.
         share: of all inputs of a campaign.
     """
 
-    inputs: Callable[[int, int], st.SearchStrategy[Any]]
+    inputs: Callable[[Scope], st.SearchStrategy[Any]]
     check: Callable[[Any], list[str]]
     share: float
 
@@ -70,7 +94,7 @@ def judged(problem: Any, p: Plan) -> list[str]:
     """A plan by the independent judge, by its own certificate, and through a file."""
     found = judge.findings(problem, p)
     if p.status.ok and p.expected is None:
-        tolerance = min(1e-2, float(np.sqrt(p.options["tolerance"])))
+        tolerance = float(np.sqrt(p.options["tolerance"]))
         certificate = call(lambda: certify(p, tolerance=tolerance))
         found += certificate.findings
         if certificate.error is None and not certificate.value.extremal:
@@ -87,7 +111,7 @@ def _kept(p: Plan) -> list[str]:
     again = called.value
     see = np.concatenate([p.mean[len(p.mean) // 2] * 1.01, [p.times[len(p.times) // 2]]])
     found = [] if again.status is p.status else ["saved and loaded: another status"]
-    if hasattr(p.problem, "decode_observation"):
+    if hasattr(p.problem, "decode_observation") or np.abs(p.mean).max() > LARGEST:
         return found
     for kind in (OpenLoop, Feedback):
         before, after = (call(lambda q=q, k=kind: k(q).predict(see)[0]) for q in (p, again))
@@ -102,15 +126,19 @@ def _kept(p: Plan) -> list[str]:
 
 
 def _reached(problem: Own, p: Plan) -> list[str]:
-    """INFEASIBLE is refuted by a path that is known, or by IPOPT from the same guess."""
-    if p.status.name != "INFEASIBLE" or p.options["integrator"] != "euler":
+    """INFEASIBLE is refuted by IPOPT from the same guess; for linear systems by a path alone.
+
+    (Of others it is a word about the neighbourhood, where IPOPT may end, too. Controls of tiny
+    bounds move the end by less than what counts as met.)
+    """
+    kind = problem.recipe.kind
+    euler = p.options["integrator"] == "euler"  # as the known path, and IPOPT's
+    if p.status.name != "INFEASIBLE" or problem.recipe.bounds == "tiny" or not euler:
         return []
-    if problem.known is None:
-        met = ipopt.meets(Own(problem.recipe.plain))
-        return ["INFEASIBLE, but IPOPT meets the end"] if met else []
+    if problem.known is not None and kind.linear:
+        return ["INFEASIBLE, but a path is known that meets the end"]
     met = ipopt.meets(Own(problem.recipe.plain))
-    word = {True: "meets it, too", False: "does not find it either", None: "was not asked"}[met]
-    return [f"INFEASIBLE, but a path is known that meets the end; IPOPT {word}"]
+    return ["INFEASIBLE, but IPOPT meets the end"] if met else []
 
 
 def _charges_noise(problem: Own, p: Plan) -> bool:
@@ -130,7 +158,7 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     q, C = other.value, Own(recipe).C
     if p.status is not q.status:
         return [f"{p.status.name}, but {q.status.name} where all is of order one"]
-    if p.status.ok and not abs(p.cost / C - q.cost) <= 1e-3 * (abs(q.cost) + q.effort):
+    if p.status.ok and not abs(p.cost / C - q.cost) <= 1e-3 * (abs(q.cost) + q.effort) + 1e-9:
         return [f"cost {p.cost / C:.6g}, but {q.cost:.6g} where all is of order one"]
     return []
 
@@ -204,33 +232,33 @@ def world_refused(changes: dict[str, Any]) -> list[str]:
 
 IDEAS = {
     "problems": Idea(
-        lambda kinds, seed: st.tuples(recipes(kinds, seed), options.taken),
+        lambda scope: st.tuples(scope.recipes(), scope.asked),
         lambda case: problem_asked(*case),
         0.55,
     ),
     "worlds": Idea(
-        lambda kinds, seed: st.tuples(worlds.worlds, options.taken),
+        lambda scope: st.tuples(worlds.worlds, scope.asked),
         lambda case: world(*case),
         0.12,
     ),
-    "scenarios": Idea(lambda kinds, seed: worlds.changes, world_refused, 0.08),
+    "scenarios": Idea(lambda scope: worlds.changes, world_refused, 0.08),
     "options": Idea(
-        lambda kinds, seed: st.tuples(recipes(3, seed, most_intervals=10), options.refused),
+        lambda scope: st.tuples(scope.recipes(3, 10), options.refused),
         lambda case: option_refused(case[0], *case[1]),
         0.08,
     ),
-    "files": Idea(lambda kinds, seed: damage.damages, damage.read_anyway, 0.08),
+    "files": Idea(lambda scope: damage.damages, damage.read_anyway, 0.08),
     "batches": Idea(
-        lambda kinds, seed: st.tuples(
-            st.lists(recipes(min(kinds, 20), seed, most_intervals=20), min_size=1, max_size=3),
+        lambda scope: st.tuples(
+            st.lists(scope.recipes(20, 20), min_size=1, max_size=3),
             st.sampled_from(({}, {"variance_weight": 0.0}, {"max_iterations": 5})),
         ),
         lambda case: batch(*case),
         0.05,
     ),
     "receding": Idea(
-        lambda kinds, seed: st.tuples(
-            recipes(min(kinds, 20), seed, most_intervals=20),
+        lambda scope: st.tuples(
+            scope.recipes(20, 20),
             st.sampled_from(({}, {"iterations": 3}, {"saturation": 0.0}, {"handover": 1})),
         ),
         lambda case: receding(*case),

@@ -15,8 +15,8 @@ Array = np.ndarray
 STEP, SUM, END, BOUND = 1e-4, 1e-6, 1e-4, 1e-9
 #: Rounding, relative to what a state is put together from.
 ROUNDING = 1e-9
-#: What is less is nothing.
-TINY = 1e-100
+#: What is less is nothing; and a part of a state that is hardly any.
+TINY, LEAST = 1e-100, 1e-4
 
 
 def findings(problem: Any, plan: Any) -> list[str]:
@@ -65,7 +65,8 @@ def _anyway(problem: Any, p: Any) -> list[str]:
         found.append("the mean does not start at the start")
     found += outside(problem, p.controls)
     if p.status.name != "SOLVER_FAILED":
-        names = ("covariance", "effort", "obstacle_cost", "running_cost", "variance")
+        names = ("effort", "obstacle_cost", "running_cost")
+        names += ("covariance", "variance") if p.status.ok else ()
         found += [f"{name} is not finite" for name in names if not _is_finite(p, name)]
         found += _costs(problem, p)
     return found
@@ -92,8 +93,19 @@ def outside(problem: Any, u: Array, part: float = BOUND) -> list[str]:
 
 
 def _costs(problem: Any, p: Any) -> list[str]:
+    """What the sums say, as far as rounding of states leaves them certain (no sine of 1e90)."""
+    here, near = (_terms(problem, p, p.mean * part) for part in (1.0, 1.0 + 1e-13))
+    return [
+        f"{name} is {getattr(p, name):.9g}, but its terms add up to {terms.sum():.9g}"
+        for name, terms in here.items()
+        if not abs(getattr(p, name) - terms.sum())
+        <= SUM * np.abs(terms).sum() + 10.0 * abs(near[name].sum() - terms.sum())
+    ]
+
+
+def _terms(problem: Any, p: Any, x: Array) -> dict[str, Array]:
     """The sums of docs/planner.md: controls at the beginning of intervals, states at their end."""
-    t, dt, x, u = p.times, np.diff(p.times), p.mean, p.controls
+    t, dt, u = p.times, np.diff(p.times), p.controls
     effort = np.einsum("k,ki,ij,kj->k", dt, u, problem.control_weight, u)
     parts = {"effort": effort, "obstacle_cost": np.zeros(1), "running_cost": np.zeros(1)}
     if getattr(problem, "penalty", None) is not None:
@@ -106,11 +118,7 @@ def _costs(problem: Any, p: Any) -> list[str]:
         running.append(np.ravel(dt[:, None] * problem.control_cost(t[:-1], x[:-1]) * u))
     if running:
         parts["running_cost"] = np.concatenate(running)
-    return [
-        f"{name} is {getattr(p, name):.9g}, but its terms add up to {terms.sum():.9g}"
-        for name, terms in parts.items()
-        if not abs(getattr(p, name) - terms.sum()) <= SUM * np.abs(terms).sum()
-    ]
+    return parts
 
 
 # --------------------------------------------------------------------------- converged plans
@@ -180,10 +188,11 @@ def _stationary(problem: Any, p: Any) -> list[str]:
     if p.options["terminal_tolerance"] > 0.0:
         return []
     x, u, t, dt = p.mean, p.controls, p.times, np.diff(p.times)
-    X, U = np.abs(x).max(axis=0) + 1e-12, np.abs(u).max(axis=0) + 1e-12
-    later = t[1:]
+    X, later = np.abs(x).max(axis=0) + TINY, t[1:]
     A = dt[:, None, None] * _slopes(lambda y: problem.drift(t[:-1], y, u), x[:-1], X)
-    B = dt[:, None, None] * _slopes(lambda v: problem.drift(t[:-1], x[:-1], v), u, U)
+    B = _pushes(problem, t, dt, x, u)
+    # A control is of its own size, but at least of what moves a state by a part of it.
+    U = np.abs(u).max(axis=0) + LEAST * np.min(X[:, None] / (np.abs(B).max(axis=0) + TINY), axis=0)
     H = _slopes(lambda y: _charged(problem, later, y)[..., None], x[1:], X)[:, 0] * dt[:, None]
     L = np.zeros_like(x[:-1])
     gradient = 2.0 * dt[:, None] * u @ problem.control_weight
@@ -200,8 +209,22 @@ def _stationary(problem: Any, p: Any) -> list[str]:
         adjoint = adjoint + A[k].T @ adjoint
         adjoint[:, 0] += L[k] + (H[k - 1] if k else 0.0)
     costs = abs(p.effort) + abs(p.obstacle_cost) + abs(p.running_cost)
-    terms, own = np.abs(gradient).max(axis=0), -p.multipliers.terminal
+    effort = 2.0 * dt.max() * np.abs(problem.control_weight) @ U
+    terms, own = np.abs(gradient).max(axis=0) + effort, -p.multipliers.terminal
     return _gained(problem, u, whole, terms, U, costs, own)
+
+
+def _pushes(problem: Any, t: Array, dt: Array, x: Array, u: Array) -> Array:
+    """dt ∂b/∂u, (K, n, m), exactly: b is affine in u, so two points tell it all."""
+    zero = np.zeros_like(u)
+    rest = problem.drift(t[:-1], x[:-1], zero)
+    scale = np.abs(u).max(axis=0) + TINY
+    columns = []
+    for j in range(u.shape[1]):
+        there = zero.copy()
+        there[:, j] = scale[j]
+        columns.append((problem.drift(t[:-1], x[:-1], there) - rest) / scale[j])
+    return dt[:, None, None] * np.stack(columns, axis=-1)
 
 
 def _charged(problem: Any, t: Array, x: Array) -> Array:

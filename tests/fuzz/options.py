@@ -38,6 +38,8 @@ REFUSED = {
 }  # fmt: skip
 
 taken = st.sampled_from(TAKEN)
+#: Those that take no seconds.
+brief = st.sampled_from(({}, {}, {"variance_weight": 0.0}, {"feedback": True}, {"starts": 2}))
 refused = st.sampled_from(sorted(REFUSED)).flatmap(
     lambda name: st.sampled_from(REFUSED[name]).map(lambda value: (name, value))
 )

@@ -37,6 +37,11 @@ class Kind:
     noise: str = "none"
     extras: tuple[str, ...] = ()
 
+    @property
+    def linear(self) -> bool:
+        """Whether what can be reached is convex, and the end asks for a point of a plane."""
+        return self.drift in ("linear", "timed", "stiff") and self.end not in ("curved",)
+
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Kind:
         """One of many: the ordinary more often than the rest."""
