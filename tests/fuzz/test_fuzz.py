@@ -12,7 +12,7 @@ from slipcar.planner import plan
 from . import judge, options
 from .calls import call
 from .ideas import IDEAS, Scope
-from .problems import Own, Recipe
+from .problems import Kind, Own, Recipe
 
 #: Inputs of each idea, and how wide they are drawn.
 COUNTS = {
@@ -35,6 +35,28 @@ def test_nothing_is_wrong_with(name):
         assert IDEAS[name].check(case) == []
 
     each()
+
+
+#: Inputs that once were findings.
+FOUND = [
+    # A raw LinAlgError: what a ball holds had a curvature of one beside an R of 1e-20.
+    ("problems", (Recipe(Kind("jump", 3, 2, "some", "certain", ("walls", "start_covariance")),
+                         7568, 80, "wild", "ball and box", (0, 6, 1, -3)),
+                  {"variance_weight": 0.0})),
+    # A plan with feedback whose gains are not finite was followed, to actions that are not.
+    ("receding", (Recipe(Kind("domain", 2, 2, "curved", "certain"), 18834380, 3, "even", "loose"),
+                  {"iterations": 3})),
+    # NumPy warned out of the replans of a drift that overflows.
+    ("receding", (Recipe(Kind("huge", 1, 1, "free"), 1184, 2, "even", "box", (-6, 1, -3, 0)),
+                  {"saturation": 0.0})),
+    # An integer beyond float64 was a raw OverflowError.
+    ("scenarios", {"clearance": 10**400}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "case"), FOUND, ids=[name for name, _ in FOUND])
+def test_what_was_found_stays_mended(name, case):
+    assert IDEAS[name].check(case) == []
 
 
 # --- the judge -----------------------------------------------------------------------------
