@@ -15,7 +15,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from . import inputs
+from . import inputs, ipopt
 from .ideas import IDEAS, Idea, Scope
 
 #: Examples of a finding that are printed.
@@ -73,6 +73,8 @@ def main() -> int:
         found = IDEAS[asked.only[0]].check(eval(asked.input, vars(inputs)))
         print(*(found or ["nothing found"]), sep="\n")
         return 1 if found else 0
+    if ipopt.MISSING:
+        print(f"INFEASIBLE is not asked of IPOPT: {ipopt.MISSING}")
     shares = sum(IDEAS[name].share for name in asked.only)
     bad = 0
     for name in asked.only:
