@@ -34,7 +34,7 @@ CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
 
-.PHONY: help install compare suites frontier reproduce report kills matrix test test-long train bench bench-worlds bench-docs lint types lock peers clean
+.PHONY: help install compare suites frontier reproduce report kills matrix test test-long fuzz train bench bench-worlds bench-docs lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -72,6 +72,9 @@ test: $(INSTALLED)  ## all tests but the long ones
 test-long: $(INSTALLED)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m long $(ARGS)
 
+fuzz: $(BENCH_INSTALLED)  ## random problems, worlds, options and files before an independent judge, minutes
+	PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)
+
 frontier: $(INSTALLED)  ## what safety costs: effort against collision rate; results/frontier
 	$(BIN)/slipcar frontier --workers $(WORKERS) $(ARGS)
 
@@ -95,7 +98,7 @@ types: $(INSTALLED)  ## mypy over the installed package
 	$(BIN)/mypy
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare suites frontier reproduce kills matrix train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
+compare suites frontier reproduce kills matrix fuzz train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
 
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

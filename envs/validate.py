@@ -42,7 +42,7 @@ def checked_array(
         if np.iscomplexobj(value):  # NumPy would only warn and drop the imaginary part
             raise TypeError("complex numbers")
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be an array of numbers, not {value!r}") from error
     if repeat_scalar and array.ndim == 0:
         array = np.full([1 if n is None else n for n in shape], float(array))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.planner.problem.control_set import control_ball, control_limits
+from slipcar.planner.problem.numbers import finite
 
 Array = np.ndarray
 
@@ -65,11 +66,21 @@ class Actuation:
     def from_dict(cls, data: dict[str, Array]) -> Actuation:
         """What :meth:`as_dict` gave."""
         return cls(
-            **{name: np.asarray(data[name], np.float64) for name in ("weight", "lower", "upper")},
-            radius=float(data["radius"]),
-            angles=tuple(int(i) for i in data["angles"]),
-            translators=tuple(str(name) for name in data["translators"]),
+            **{name: data[name] for name in ("weight", "lower", "upper")},
+            radius=data["radius"].item(),
+            angles=tuple(data["angles"].tolist()),
+            translators=tuple(data["translators"].tolist()),
         )
+
+    def check(self, n: int, m: int) -> None:
+        """Raise ValueError unless these are of a problem with n states and m controls."""
+        finite("weight", self.weight, (m, m))
+        kinds = {np.asarray(value).dtype.kind for value in (self.lower, self.upper, self.radius)}
+        if kinds != {"f"}:
+            raise ValueError(f"bounds must be real, not {self.lower}, {self.upper}, {self.radius}")
+        control_ball(self.radius, *control_limits(np.stack([self.lower, self.upper]), m))
+        if any(not isinstance(i, int) or not 0 <= i < n for i in self.angles):
+            raise ValueError(f"angles must be components of {n} states, not {self.angles}")
 
 
 def actuation_of(plan: Any) -> Actuation:

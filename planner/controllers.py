@@ -158,11 +158,22 @@ class Feedback(OpenLoop):
                 weight_matrix("R", own if R is None else R, m, definite=True),
                 weight_matrix("Qf", Qf, n),
             )
-            gains = tracking.lqr_gains(plan.A, plan.B, np.diff(plan.times), *weights)
+            with np.errstate(all="ignore"):  # of a plan that leads nowhere
+                gains = tracking.lqr_gains(plan.A, plan.B, np.diff(plan.times), *weights)
+            if not np.isfinite(gains).all():
+                Q, R, Qf = (float(np.abs(weight).max()) for weight in weights)
+                raise ValueError(
+                    f"the LQR around this {plan.status.name} plan has no finite gains: weights are "
+                    f"up to Q {Q:.3g}, R {R:.3g} and Qf {Qf:.3g}, its linearisation up to "
+                    f"A {np.abs(plan.A).max():.3g} and B {np.abs(plan.B).max():.3g}; give Q and "
+                    f"Qf in proportion to R, in the problem's units"
+                )
         gains = np.asarray(gains, dtype=np.float64)
         wanted = (len(plan.controls), m, n)
         if gains.shape != wanted or not np.isfinite(gains).all():
-            raise ValueError(f"gains must be finite and of shape {wanted}, not {gains.shape}")
+            raise ValueError(
+                f"the plan's gains must be finite and of shape {wanted}, not {gains.shape}"
+            )
         super().__init__(plan.replace(gains=gains))
         self._admissible = self._limits()
 

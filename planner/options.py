@@ -173,6 +173,8 @@ class Guesses:
             check_count("starts", self.starts)
         check_choice("cold_start", self.cold_start, ("auto", "always", "never"))
         check_flag("free_first", self.free_first, none_allowed=True)
+        for name in ("shooting", "free_final_time", "check_derivatives"):
+            check_flag(name, getattr(self, name))
         if (self.starts or 1) > 1 and self.guess is not None:
             raise ValueError(
                 "starts > 1 and guess exclude each other: starts makes its own guesses"
@@ -194,7 +196,9 @@ def check_choice(name: str, value: Any, known: Collection[str]) -> None:
 
 def check_flag(name: str, value: Any, *, none_allowed: bool = False) -> None:
     """Raise ValueError unless the value is a truth value (or None)."""
-    if value not in ((None, True, False) if none_allowed else (True, False)):
+    if value is None and none_allowed:
+        return
+    if not isinstance(value, (bool, np.bool_, int)) or value not in (0, 1):
         known = "None, True or False" if none_allowed else "True or False"
         raise ValueError(f"{name} must be {known}, not {value!r}")
 

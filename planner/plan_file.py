@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import numbers
 import os
 from collections.abc import Sequence
 from importlib.metadata import entry_points
@@ -15,6 +16,7 @@ import numpy as np
 
 from slipcar.planner import records
 from slipcar.planner.actuation import Actuation
+from slipcar.planner.problem.numbers import finite
 from slipcar.planner.records import Columns, Iteration
 from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
@@ -27,6 +29,8 @@ _ARRAYS = ("times", "mean", "controls", "covariance", "guess", "A", "B", "gains"
 _SCALARS = (
     "effort", "obstacle_cost", "running_cost", "variance", "iterations", "solve_time", "message",
 )  # fmt: skip
+#: What a file that is no plan's, or no longer one's, makes of the steps that read it.
+_DAMAGE = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
 _COLUMNS = [field.name for field in dataclasses.fields(Iteration)]
 
 
@@ -93,7 +97,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         beside = "" if named == Path(path) else f" or {named}"
         raise FileNotFoundError(f"no plan at {path}{beside}")
     try:
-        with np.load(file_path, allow_pickle=False) as file:
+        # Opened here, for NumPy leaves open what turns out not to be a zip file.
+        with open(file_path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
         version = header.get("format")
@@ -101,27 +106,61 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"{path} is not a plan or is damaged: {error}") from error
     if version not in _READ:
         raise ValueError(f"{path} has plan format {version!r}; this version reads {list(_READ)}")
-    expected, risk = header.get("expected"), header.get("risk")  # not in format 2
     try:
-        problem = _problem_from_data(header["problem"])
-        actuation = _strip(arrays, "actuation.") if problem is None else {}  # not before 4
-        return {
-            **{name: arrays[name] for name in _ARRAYS if name != "gains"},
-            **{name: header[name] for name in _SCALARS},
-            "gains": arrays.get("gains"),
-            "status": Status[header["status"]],
-            "history": _history(_strip(arrays, "history.")),
-            "multipliers": records.Multipliers.from_dict(_strip(arrays, "multipliers.")),
-            "options": header["options"],
-            "problem": problem,
-            "actuation": Actuation.from_dict(actuation) if actuation else None,
-            "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
-            "time_search": tuple(records.TimeStep(**row) for row in header["time_search"]),
-            "expected": records.ExpectedCost(**expected) if expected else None,
-            "risk": Risk.from_dict(risk) if risk else None,
-        }
-    except (KeyError, TypeError) as error:
+        fields = _fields(arrays, header)
+        _check(fields)
+    except _DAMAGE as error:
         raise ValueError(f"{path} is not a plan or is damaged: {error!r}") from error
+    return fields
+
+
+def _fields(arrays: dict[str, Array], header: dict[str, Any]) -> dict[str, Any]:
+    """A plan's fields from what is in its file."""
+    expected, risk = header.get("expected"), header.get("risk")  # not in format 2
+    problem = _problem_from_data(header["problem"])
+    actuation = _strip(arrays, "actuation.") if problem is None else {}  # not before 4
+    return {
+        **{name: arrays[name] for name in _ARRAYS if name != "gains"},
+        **{name: header[name] for name in _SCALARS},
+        "gains": arrays.get("gains"),
+        "status": Status[header["status"]],
+        "history": _history(_strip(arrays, "history.")),
+        "multipliers": records.Multipliers.from_dict(_strip(arrays, "multipliers.")),
+        "options": header["options"],
+        "problem": problem,
+        "actuation": Actuation.from_dict(actuation) if actuation else None,
+        "alternatives": tuple(_alternative(row) for row in header["alternatives"]),
+        "time_search": tuple(records.TimeStep(**row) for row in header["time_search"]),
+        "expected": records.ExpectedCost(**expected) if expected else None,
+        "risk": Risk.from_dict(risk) if risk else None,
+    }
+
+
+def _check(fields: dict[str, Any]) -> None:
+    """Raise ValueError unless arrays are of one plan and the rest is of its type."""
+    (N,) = finite("times", fields["times"], (None,)).shape
+    n = finite("mean", fields["mean"], (N, None)).shape[1]
+    m = finite("controls", fields["controls"], (N - 1, None)).shape[1]
+    shapes = {
+        "covariance": (N, n, n), "guess": (N, n), "A": (N - 1, n, n), "B": (N - 1, n, m),
+        "gains": (N - 1, m, n),
+    }  # fmt: skip
+    for name in ("times", "mean", "controls", *shapes):
+        array = fields[name]
+        if array is None:  # gains alone may be
+            continue
+        if array.dtype.kind != "f" or array.shape != shapes.get(name, array.shape):
+            raise ValueError(
+                f"{name} must be real of shape {shapes[name]}, not {array.dtype} of {array.shape}"
+            )
+    for name in _SCALARS:
+        kind = str if name == "message" else numbers.Real
+        if not isinstance(fields[name], kind):
+            raise ValueError(f"{name} must be a {kind.__name__}, not {fields[name]!r}")
+    if not isinstance(fields["options"], dict):
+        raise ValueError(f"options must be an object, not {fields['options']!r}")
+    if (actuation := fields["actuation"]) is not None:
+        actuation.check(n, m)
 
 
 def _alternative(row: dict[str, Any]) -> records.Alternative:

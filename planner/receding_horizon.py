@@ -83,7 +83,8 @@ class RecedingHorizon(OpenLoop):
 
     Raises:
         TypeError: if the problem lacks a required member.
-        ValueError: for an argument out of range, or a problem it does not know.
+        ValueError: for an argument out of range, a problem it does not know, or one whose plan with
+            feedback has no finite gains.
     """
 
     closed_loop = True
@@ -127,17 +128,23 @@ class RecedingHorizon(OpenLoop):
         self._replanner = replanning.Replanner(
             problem, stakes, int(iterations), float(tolerance), int(workers), compiled
         )
-        steered = solve_noise(
-            self._replanner.posed, stakes, nominal.mean, nominal.controls,
-            tolerance=float(tolerance), max_iterations=_FIRST,
-        )  # fmt: skip
+        with np.errstate(all="ignore"):
+            steered = solve_noise(
+                self._replanner.posed, stakes, nominal.mean, nominal.controls,
+                tolerance=float(tolerance), max_iterations=_FIRST,
+            )  # fmt: skip
+        if not np.isfinite(steered.gains).all():
+            raise ValueError(
+                f"RecedingHorizon has no first plan to follow: the plan with feedback ended "
+                f"{nominal.status.name}, its gains are not finite ({nominal.message})"
+            )
         self._first: replanning.Plans = {name: getattr(steered, name) for name in replanning.FIELDS}
         super().__init__(
             nominal.replace(
                 **steered_fields(steered, model),
                 iterations=nominal.iterations + steered.iterations,
                 solve_time=time.perf_counter() - began,
-                message="",
+                message="" if steered.status.ok else nominal.message,
             )
         )
         self.replans, self.failures, self.seconds = 0, 0, 0.0
@@ -237,7 +244,8 @@ class RecedingHorizon(OpenLoop):
             return u
         began, again = time.perf_counter(), rows[wanted]
         tails = {name: array[again, _from(name, k)] for name, array in plans.items()}
-        ok = self._replanner.replan(tails, x[wanted], k)
+        with np.errstate(all="ignore"):  # replans that are not finite are not used
+            ok = self._replanner.replan(tails, x[wanted], k)
         kept = again[ok]
         for name, array in tails.items():
             plans[name][kept, _from(name, k)] = array if len(kept) == len(ok) else array[ok]

@@ -200,7 +200,9 @@ class Subproblem:
             across = eye - t[:, :, None] * t[:, None, :]
             curvature = (pieces.press / self.radius)[:, None, None] * across
             H, r = H + curvature, r - np.matmul(curvature, self.center[..., None])[..., 0]
-        M = np.linalg.inv(P @ H @ P + (eye - P)) - (eye - P)
+        # What is held is given a curvature of H's size, whatever its unit, and taken out again.
+        size = np.einsum("kii->k", H)[:, None, None] / H.shape[1]
+        M = np.linalg.inv(P @ H @ P + size * (eye - P)) - (eye - P) / size
         pull = r + np.matmul(H, fixed[..., None])[..., 0]
         return M, fixed - np.matmul(M, pull[..., None])[..., 0]
 

@@ -22,7 +22,7 @@ def control_limits(given: Any, m: int) -> tuple[Array, Array]:
         return np.full(m, -np.inf), np.full(m, np.inf)
     try:
         bounds = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         bounds = np.full(0, np.nan)
     if bounds.shape == (m,):
         bounds = np.stack([-bounds, bounds])
@@ -45,7 +45,7 @@ def control_ball(given: Any, lower: Array, upper: Array) -> float:
         return float("inf")
     try:
         radius = float(given)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         radius = float("nan")
     if not radius > 0.0:
         raise ValueError(f"control_radius must be None or a number > 0, not {given!r}")

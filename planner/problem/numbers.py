@@ -17,8 +17,10 @@ def finite(name: str, value: Any, shape: tuple[int | None, ...]) -> Array:
         ValueError: naming it, the shape or the entry.
     """
     try:
+        if np.iscomplexobj(value):  # NumPy would only warn and drop the imaginary part
+            raise TypeError("complex numbers")
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be numbers, not {value!r}") from error
     if not fits(array, shape):
         wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"

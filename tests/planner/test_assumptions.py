@@ -152,6 +152,29 @@ def test_a_drift_that_bends_with_the_control_is_refused(drift):
     refused(r"drift must be affine in the control.*component 1 is not", Cart(drift=drift))
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1e6, 1e9])
+def test_a_drift_that_bends_is_refused_in_any_unit_of_the_control(unit):
+    """Controls of order `unit`; a step of one is nothing beside them, or far beyond them."""
+
+    def drift(t, x, u):
+        v = u[..., 0] / unit
+        return np.stack([x[..., 1], v + 0.1 * v**2], -1)
+
+    refused(
+        r"drift must be affine in the control.*component 1 is not",
+        Cart(drift=drift, control_weight=np.eye(1) / unit**2),
+    )
+
+
+def test_a_drift_that_is_affine_within_the_bounds_is_taken():
+    """What saturates at the bounds bends beyond them alone."""
+
+    def drift(t, x, u):
+        return np.stack([x[..., 1], np.clip(u[..., 0], -4.0, 4.0)], -1)
+
+    assert plan(Cart(drift=drift, control_bounds=np.array([4.0]))).status is Status.CONVERGED
+
+
 def test_a_product_of_two_controls_is_not_affine():
     def drift(t, x, u):
         return np.stack([u[..., 0] * u[..., 1], u[..., 0]], -1)

@@ -63,6 +63,15 @@ def test_a_goal_that_is_just_out_of_reach():
     assert "g[" in q.message
 
 
+@pytest.mark.parametrize("cost", [1e-20, 1e-12, 1e12])
+def test_a_ball_is_kept_whatever_the_unit_of_the_cost(cost):
+    """What is held at the ball needs a curvature of R's size: a one beside 1e-20 is singular."""
+    p, q = (plan(Ship(1.7, control_weight=c * np.eye(2)), tolerance=1e-10) for c in (1.0, cost))
+    assert np.isclose(np.linalg.norm(p.controls, axis=1), 1.7, rtol=1e-9).any()
+    assert (p.status, q.status) == (Status.CONVERGED, Status.CONVERGED)
+    np.testing.assert_allclose(q.controls, p.controls, atol=1e-4)
+
+
 def test_the_regulator_with_a_bounded_thrust_in_closed_form():
     # min Σ dt ‖u − c‖² (up to a constant): the projection of c onto the ball, at every node.
     centre = np.array([3.0, -4.0])

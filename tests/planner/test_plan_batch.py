@@ -1,10 +1,13 @@
 """`plan_batch` keeps its promise: each plan is the one that `plan` gives."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Plan, Status, plan, plan_batch
+from slipcar.planner.search.tasks import in_threads
 
 
 class Pendulum:
@@ -109,6 +112,19 @@ def test_start_states_are_those_of_reposed_problems(paper):
     for workers in (1, 3):
         again = plan_batch(paper, initial_states=states, workers=workers)
         assert all(_same(a, b) for a, b in zip(batch, again, strict=True))
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_what_numpy_does_about_overflow_is_the_callers_word_in_any_thread(workers):
+    def overflowing(x):
+        return np.array([1e300]).dot(np.array([x]))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with np.errstate(all="ignore"):
+            assert in_threads(overflowing, [1e300, 2e300, 3e300], workers) == [np.inf] * 3
+        with np.errstate(all="raise"), pytest.raises(FloatingPointError):
+            in_threads(overflowing, [1e300, 2e300, 3e300], workers)
 
 
 def test_start_states_of_an_own_system():

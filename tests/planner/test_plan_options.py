@@ -329,6 +329,10 @@ def test_errors_of_callbacks_come_through(paper, options):
         ({"solver": 3}, "solver must be a name or an object"),
         ({"solver": None}, "solver must be a name or an object"),
         ({"free_first": "no"}, "free_first must be"),
+        ({"free_first": np.ones(2)}, "free_first must be"),
+        ({"shooting": "yes"}, "shooting must be"),
+        ({"free_final_time": 2}, "free_final_time must be"),
+        ({"check_derivatives": []}, "check_derivatives must be"),
     ],
 )
 def test_conflicts_are_told(paper, options, message):
