@@ -68,7 +68,7 @@ class Tuning(NamedTuple):
     armijo: float = 1e-3
     searches: int = 8
     long_searches: int = 14
-    rejections: int = 3
+    rejections: int = 5
     falls_back: bool = True
     patience: int = 8
     longest: float = 0.3
