@@ -53,7 +53,7 @@ def batch(
 
     return Contender(
         name=f"{_NAME}, {workers} thread{'s' if workers > 1 else ''}",
-        tolerance=f"step {tolerance:.0e}",
+        tolerance=f"residual² {tolerance:.0e}",
         solve=stopwatch(call, _answer),
         plans=count,
         threads=workers,
@@ -72,7 +72,7 @@ def new_worlds(count: int = WORLDS) -> Contender:
 
     return Contender(
         name=f"{_NAME} of new random worlds, 1 thread, w = 1",
-        tolerance=f"step {DEFAULT_TOLERANCE:.0e}",
+        tolerance=f"residual² {DEFAULT_TOLERANCE:.0e}",
         solve=solve,
         solves=RANDOM_WORLDS,
         plans=count,
