@@ -108,7 +108,9 @@ class Multipliers:
 
     def normalized(self) -> Multipliers:
         """Scaled so that (𝔭, p⁰, p¹) has norm one."""
-        scale = float(np.sqrt(np.sum(self.terminal**2) + self.cost**2 + self.trust_region**2))
+        whole = np.append(self.terminal, [self.cost, self.trust_region])
+        largest = float(np.abs(whole).max())  # whose square may overflow
+        scale = largest * float(np.linalg.norm(whole / largest))
         return Multipliers(**{name: value / scale for name, value in vars(self).items()})
 
     def as_dict(self) -> dict[str, Array]:

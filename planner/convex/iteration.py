@@ -262,7 +262,7 @@ class _Attempt:
         # the force it stands for, p¹ (x − x_k), must vanish too (beside that of the terminal
         # penalty, where it is at its limit).
         force = proposal.multiplier * (1.0 if feasible else self.first_rho / self.rho)
-        step += force**2 * proposal.radius
+        step += force * force * proposal.radius
         settled = step + self.last_step <= self.options.tolerance * lin.effort
         self.last_step = step
         if not settled:

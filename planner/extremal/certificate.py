@@ -31,8 +31,7 @@ from slipcar.planner.status import Status
 
 Array = np.ndarray
 
-#: Multipliers are normalised to length one; a |p⁰| below this is as good as none. (Early iterates
-#: of hard worlds are far from anything feasible, and have multipliers of 10⁸ for a cost of one.)
+#: Multipliers are normalised to length one; a |p⁰| below this is as good as none.
 _VANISHING = 1e-14
 #: A sub-problem that lacks more than this of its terminal condition, per unit of the state, was
 #: solved with that condition relaxed: its multiplier is the limit ρ, and normal by construction.
@@ -134,6 +133,8 @@ class Certificate:
         adjoint: p at every node by the adjoint recursion, p⁰ = −1, (N, n).
         adjoint_difference: largest difference from the plan's own adjoint.
         adjoint_off: the same, relative to the largest of each component.
+        limit: |p⁰| of the plan and its last sub-problem, the smaller, beside multipliers in units
+            of the cost and of how far each terminal condition moves.
         transversality: max_U H at the end, which vanishes when the final time is free; None when
             it is fixed.
         cost_rate: mean cost per time, the scale of `transversality`.
@@ -151,6 +152,7 @@ class Certificate:
     adjoint: Array
     adjoint_difference: float
     adjoint_off: float
+    limit: float
     transversality: float | None
     cost_rate: float
     tolerance: float
@@ -166,8 +168,7 @@ class Certificate:
 
         Multipliers of early iterates may be huge far from anything feasible, and say nothing.
         """
-        last = np.abs(self.cost_history[-1:])
-        return float(np.min(last, initial=abs(self.multipliers.cost))) > _VANISHING
+        return self.limit > _VANISHING
 
     @property
     def residuals(self) -> dict[str, float]:
@@ -253,6 +254,7 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
     lin = broken.at.lin
     adjoint = -np.vstack([lin.A[0].T @ broken.adjoint[0], broken.adjoint])
     off = adjoint[1:] - own.adjoint[1:]
+    ends = [own.terminal, *(h.terminal_multiplier for h in plan.history[-1:])]
     history = [
         Multipliers(-h.terminal_multiplier, -1.0, -h.trust_multiplier, own.adjoint).normalized()
         for h in plan.history
@@ -271,9 +273,18 @@ def certify(plan: Any, *, tolerance: float = 1e-2, time_weight: float | None = N
         violations=broken, adjoint=adjoint,
         adjoint_difference=_largest(off),
         adjoint_off=_largest(off / broken.scales.adjoint),
+        limit=_limit(model, broken, ends),
         transversality=transversality, cost_rate=max(rate, abs(time_weight or 0.0), 1e-300),
         tolerance=float(tolerance),
     )  # fmt: skip
+
+
+def _limit(model: Model, broken: Violations, multipliers: list[Array]) -> float:
+    """The least |p⁰| of ‖(𝔭, p⁰)‖ = 1, 𝔭 (q,) in units that do not matter."""
+    lin, size = broken.at.lin, broken.scales.control
+    least = float(size * size @ np.diagonal(model.R)) * float(model.dt.sum())
+    unit = broken.scales.end / (lin.effort + lin.penalty + abs(lin.running) + least)
+    return min(float(1.0 / np.sqrt(1.0 + np.square(unit * p).sum())) for p in multipliers)
 
 
 def _largest(values: Array) -> float:

@@ -73,8 +73,8 @@ class Evaluation(NamedTuple):
         running: Σ dt (H + ℓᵀu).
         charged: rows, noise and a soft end, spread and weights held.
         pull: Σ λᵀf + νᵀg.
-        gap: Σ |λᵀf|.
-        miss: |νᵀg| of an exact end.
+        gap: Σ |λᵀf| + √(fᵀΛf), Λ the mean of λλᵀ over the path.
+        miss: Σ |ν_j g_j| of an exact end.
         defect: largest |f|.
         residual: largest |g| of an exact end.
         penalty: Σ dt Σ w max(0, c)² at the mean.
@@ -115,8 +115,8 @@ class Promise(NamedTuple):
         length: ∫ ΔuᵀRΔu dt.
         radius: ∫ ‖Δx‖² dt.
         pull: Σ λᵀf + νᵀg at the iterate.
-        gap: Σ |λᵀf| there.
-        miss: |νᵀg| there.
+        gap: Σ |λᵀf| + √(fᵀΛf) there.
+        miss: Σ |ν_j g_j| there.
         changed: bounds that are passed and were not held, or the other way round.
         unseen: what hinges cost after the step that are off in the model.
         turned: hinges that are on after the step and off in the model, or the other way round.

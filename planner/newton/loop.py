@@ -29,9 +29,10 @@ After each step the belief follows: covariance, rows' spread, weights P and gain
 (:mod:`slipcar.planner.moments.propagation`). Its fixed points are stationary points of the expected
 cost in controls and gains, but for how ∂b/∂x, σ′, C and ½ tr(∂²c Σ) follow.
 
-The merit function is Φ = cost + Σ λᵀf + νᵀg + s (½ Σ |λᵀf| + ½ |νᵀg|), f the defects of the
-dynamics and g the terminal condition, with s ≥ 1 large enough that the step descends. Nothing in it
-depends on the units or the axes of states and controls.
+The merit function is Φ = cost + Σ λᵀf + νᵀg + s (Σ |λᵀf| + Σ √(fᵀΛf) + Σ |ν_j g_j|), f the
+defects of the dynamics, g the terminal condition and Λ the mean of λλᵀ over the path of the step
+before, with s ≥ 1 large enough that the step descends. Nothing in it depends on the units or the
+axes of states and controls.
 """
 
 from __future__ import annotations

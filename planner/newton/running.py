@@ -96,7 +96,7 @@ def solve_mean(
     workspace = borrow(posed.program(_MEAN), len(model.dt))
     load(workspace, posed, model.weight, x, u)
     task = Task(
-        tolerance=options.tolerance, max_iterations=options.max_iterations,
+        tolerance=options.tolerance * model.coupling**2, max_iterations=options.max_iterations,
         bounded=model.bounded, state_cost=model.has("state_cost"),
         released=free_first and len(model.weight) > 0,
         variance_weight=w,

@@ -89,6 +89,16 @@ class Model:
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @functools.cached_property
+    def coupling(self) -> float:
+        """The least eigenvalue of R with its diagonal scaled to ones: 1 if it is diagonal.
+
+        A residual measured control by control bounds the one in the norm of R by its inverse.
+        """
+        scale = 1.0 / np.sqrt(self.R.diagonal())
+        scaled = scale[:, None] * self.R * scale
+        return 1.0 if np.count_nonzero(self.R) == len(self.R) else np.linalg.eigvalsh(scaled)[0]
+
+    @functools.cached_property
     def jacobians(self) -> Jacobians:
         """Derivatives of the functions as they are now."""
         return Jacobians(self.problem, self.state_dim, self.control_dim)
@@ -318,7 +328,7 @@ def _checked(problem: Any) -> Model:
         radius=control_ball(getattr(problem, "control_radius", None), lower, upper),
         weight=_checked_penalties(problem, times[:2], start, len(R)),
     )
-    for name in ("state_dim", "control_dim", "bounded"):
+    for name in ("state_dim", "control_dim", "bounded", "coupling"):
         getattr(model, name)  # once, for all copies of it
     return model
 

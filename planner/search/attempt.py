@@ -42,7 +42,7 @@ Array = np.ndarray
 _OWN, _SHARED = 60, 0.5
 #: The convex scheme stops on its steps: times that it goes on with smaller ones, each a hundredth,
 #: until the maximum principle holds.
-_REFINED = 4
+_REFINED = 3
 #: Nearly feasible, relative to how far the states move.
 _NEARLY = 1e-3
 
@@ -113,8 +113,8 @@ def attempt(task: Task, options: Options, *, history: bool = True) -> Outcome:
         ended.append(_convex(second, options.with_iterations(left)))
         if ended[-1].status in (Status.CONVERGED, Status.STOPPED, Status.INFEASIBLE):
             return _joined(ended)
-    best = _best(task.model, options, ended)
-    return _explained(task.model, options, _joined([*ended, best], count=len(ended)))
+    best = _explained(task.model, options, _best(task.model, options, ended))
+    return _joined([*ended, best], count=len(ended))
 
 
 def _newton(task: Task, options: Options, *, judged: bool, history: bool) -> Outcome:
@@ -162,31 +162,32 @@ def _best(model: Model, options: Options, ended: list[Outcome]) -> Outcome:
 def _convex(task: Task, options: Options) -> Outcome:
     """The convex scheme, with smaller steps until the maximum principle holds."""
     outcome = _convex_once(task, options)
-    for power in range(1, _REFINED):
+    for power in range(1, _REFINED + 1):
+        proven = _certified(task, options, outcome)
         left = options.max_iterations - outcome.iterations
-        if outcome.status is not Status.CONVERGED or left <= 0 or _holds(task, options, outcome):
-            break
+        if proven.status is outcome.status or left <= 0:
+            return _explained(task.model, options, proven)
         smaller = dataclasses.replace(
             options, tolerance=options.tolerance * 1e-2**power, max_iterations=left
         )
         onwards = dataclasses.replace(task, x=outcome.x, u=outcome.u, free_first=False)
         again = _convex_once(onwards, smaller)
         history = (*outcome.history, *again.history)
-        if again.status is Status.SOLVER_FAILED:
-            break
         outcome = dataclasses.replace(again, iterations=len(history), history=history)
-    if outcome.status is Status.CONVERGED and not _holds(task, options, outcome):
-        outcome = dataclasses.replace(outcome, status=Status.MAX_ITERATIONS)
-    return _explained(task.model, options, outcome)
+    return _explained(task.model, options, _certified(task, options, outcome))
 
 
-def _holds(task: Task, options: Options, outcome: Outcome) -> bool:
-    """Whether the maximum principle does, to the tolerance of the options."""
+def _certified(task: Task, options: Options, outcome: Outcome) -> Outcome:
+    """A converged outcome with the adjoint that proves it; MAX_ITERATIONS where none does."""
+    if outcome.status is not Status.CONVERGED:
+        return outcome
     off = violations(
         task.model, outcome.x, outcome.u, outcome.terminal,
         variance_weight=options.variance_weight, terminal_tolerance=options.terminal_tolerance,
     )  # fmt: skip
-    return off.maximality <= math.sqrt(options.tolerance)
+    if off.maximality <= math.sqrt(options.tolerance):
+        return dataclasses.replace(outcome, adjoint=off.adjoint)
+    return dataclasses.replace(outcome, status=Status.MAX_ITERATIONS)
 
 
 def _convex_once(task: Task, options: Options) -> Outcome:

@@ -34,6 +34,55 @@ def test_the_default_call_is_certified_and_within_a_percent_of_ipopt(systems, na
     assert cost <= system.optimum + 0.01 * abs(system.optimum)
 
 
+def test_an_inverted_pendulum_stands_for_twenty_seconds(systems):
+    make = systems("mechanisms").Upright
+    for seconds in (10.0, 20.0):
+        p = plan(make(seconds), variance_weight=0.0, tolerance=1e-8)
+        assert p.status is Status.CONVERGED
+        assert p.effort == pytest.approx(5.703873, abs=1e-6)
+
+
+class Coupled:
+    """Two controls whose weights are coupled and whose own cost is least elsewhere."""
+
+    start, times = np.array([0.0, 0.0]), np.linspace(0.0, 2.0, 21)
+    control_weight = np.array([[1.0, 0.99], [0.99, 1.0]])
+
+    def drift(self, t, x, u):
+        return np.stack([u[..., 0] + np.sin(x[..., 1]), u[..., 1] - x[..., 0] ** 2], axis=-1)
+
+    def diffusion(self, t, x):
+        return np.zeros((*x.shape, 1))
+
+    def control_cost(self, t, x):
+        return np.stack([np.sin(x[..., 0]), 0.5 + 0.0 * x[..., 0]], axis=-1)
+
+    def terminal(self, x):
+        return x - np.array([1.0, -1.0])
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-10])
+def test_coupled_control_weights_are_certified_at_the_plans_own_tolerance(tolerance):
+    p = plan(Coupled(), variance_weight=0.0, tolerance=tolerance)
+    assert p.status is Status.CONVERGED
+    assert p.certificate.residuals["u = argmax H"] <= np.sqrt(tolerance)
+
+
+class Nowhere(Coupled):
+    """Ends that contradict each other, in small units."""
+
+    control_weight = 1e6 * np.eye(2)
+
+    def terminal(self, x):
+        return 1e-3 * np.stack([x[..., 0] - 1.0, x[..., 0] - 2.0], axis=-1)
+
+
+def test_contradictory_ends_are_named_whatever_the_status():
+    p = plan(Nowhere(), variance_weight=0.0)
+    assert not p.status.ok
+    assert "g[" in p.message
+
+
 @pytest.mark.parametrize("name", ["CartPole", "Arm", "CSTR"])
 @pytest.mark.parametrize("seed", range(4))
 def test_disturbed_guesses_converge(systems, name, seed):
