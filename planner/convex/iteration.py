@@ -13,6 +13,9 @@ limits on the controls would make it saturate them, up to paths from which no wa
 act from when steps have become short. Should the iteration settle all the same where the terminal
 condition cannot be met, it is run once more, with limits and short steps from the beginning. At
 the end, where convergence is linear, steps are lengthened or combined (:mod:`.acceleration`).
+
+All of this happens in units of the problem's own size (:mod:`.units`); only the paper's trust
+region, which is a number of the user's, is in the user's.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from slipcar.planner.convex.merit import Iterate, Merit, iterate_at
 from slipcar.planner.convex.solvers.interface import Solution, Solver
 from slipcar.planner.convex.subproblem import convexify, variance_of
 from slipcar.planner.convex.trust_region import Step, TrustRegion
+from slipcar.planner.convex.units import ScaledModel, identity_units, natural_units, scaled
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
@@ -58,16 +62,20 @@ def iterate(
     Raises:
         ValueError: if the model functions are not finite along the guess.
     """
-    bold = _Attempt(model, solver, trust, options, x, u).run()
+    box = options.terminal_tolerance > 0.0
+    units = identity_units(model, x) if trust.limits_radius else natural_units(model, x, u, box=box)
+    there = scaled(model, units)
+    bold = _Attempt(there, solver, trust, options, x, u).run()
     left = options.max_iterations - len(bold.history)
     if bold.status is not Status.INFEASIBLE or left <= 0:
         return bold
     opening = bold.history[0]
-    cautious = trust.cautious(opening.predicted / max(opening.trust_radius, 1e-300))
+    promised = opening.predicted / units.cost
+    cautious = trust.cautious(promised / max(opening.trust_radius, 1e-300))
     if cautious is None:
         return bold
     options = dataclasses.replace(options, max_iterations=left)
-    careful = _Attempt(model, solver, cautious, options, x, u).run()
+    careful = _Attempt(there, solver, cautious, options, x, u).run()
     off_careful, off_bold = (
         max(
             feasibility.inconsistency(at),
@@ -86,12 +94,17 @@ class _Proposal:
     """A sub-problem's solution."""
 
     solution: Solution
-    lacking: float  # its virtual control
+    beyond: Array  # what each terminal condition lacks, (q,)
     radius: float  # ∫ E‖x − x_k‖² dt of the step; its mean's part while no trust region acts
     multiplier: float  # of the trust region, −p¹
     step: float  # ∫ ‖u_{k+1} − u_k‖² dt
     length: float  # the same in the norm of R
     short: float  # what the solution leaves of the terminal condition, relative
+
+    @property
+    def lacking(self) -> float:
+        """Its virtual control."""
+        return float(self.beyond.sum())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,19 +119,33 @@ class _Candidate:
 
 
 class _Attempt:
-    """One run of the loop: the iterate, its multipliers, and what has been tried."""
+    """One run of the loop: the iterate, its multipliers, and what has been tried.
+
+    The guess is in the user's units, as are the outcome and the history; all else in the model's.
+    """
 
     def __init__(
-        self, model: Model, solver: Solver, trust: TrustRegion, options: Options, x: Array, u: Array
+        self,
+        model: ScaledModel,
+        solver: Solver,
+        trust: TrustRegion,
+        options: Options,
+        x: Array,
+        u: Array,
     ) -> None:
-        self.model, self.solver, self.trust, self.options = model, solver, trust, options
+        self.model, self.solver, self.trust, self.asked = model, solver, trust, options
+        units = model.units
+        self.options = options = dataclasses.replace(
+            options, variance_weight=options.variance_weight * units.time / units.cost,
+            terminal_tolerance=options.terminal_tolerance / units.end.max(initial=1e-300),
+        )  # fmt: skip
         self.composite = options.linearization == "composite"
         clock = time.perf_counter()
-        self.at = iterate_at(model, options.variance_weight, x, u)
+        self.at = iterate_at(model, options.variance_weight, x / units.state, u / units.control)
         self.linearize_seconds = time.perf_counter() - clock
         lin = self.at.lin
         if not lin.finite:
-            raise ValueError(feasibility.not_finite(model, x, u))
+            raise ValueError(feasibility.not_finite(model.original, x, u))
         self.adjoint, self.terminal = np.zeros(lin.defect.shape), np.zeros(lin.g.shape)
         self.trust_multiplier = 0.0
         self.rho = self.first_rho = _FIRST_RHO * max(1.0, feasibility.terminal_force(model, lin))
@@ -168,19 +195,19 @@ class _Attempt:
     def solve(self) -> _Proposal:
         """Solve the sub-problem with the multiplier that the trust region asks for."""
         model, options, trust = self.relaxed or self.model, self.options, self.trust
-        weight: Array | None = None
+        lin, weight = self.at.lin, None
         for _ in range(_TRIES):
             if weight is None and (trust.multiplier > 0.0 or trust.limits_radius):
                 weight = self.trust_weight()
             multiplier = trust.multiplier
             sub = convexify(
-                model, self.at.lin, variance=self.at.variance, composite=self.composite,
+                model, lin, variance=self.at.variance, composite=self.composite,
                 trust_multiplier=multiplier, trust_weight=weight,
                 rho=self.rho, tolerance=options.terminal_tolerance,
             )  # fmt: skip
             solution = self.solver.solve(sub)
             if not solution.found:
-                return _Proposal(solution, np.nan, np.nan, multiplier, np.nan, np.nan, np.nan)
+                return _Proposal(solution, lin.g, np.nan, multiplier, np.nan, np.nan, np.nan)
             d = solution.d
             if weight is None:
                 radius = float(np.vdot(model.dt[:, None] * d, d))
@@ -190,20 +217,17 @@ class _Attempt:
                 break
         e = model.dt[:, None] * solution.e
         step, length = float(np.vdot(e, solution.e)), float(np.vdot(e @ model.R, solution.e))
-        lin = self.at.lin
-        short = feasibility.lacks(lin, options.terminal_tolerance, lin.g + lin.G @ d[-1]).max(
-            initial=0.0
-        )
-        lacking = sub.virtual_control(d)
-        return _Proposal(solution, lacking, radius, multiplier, step, length, float(short))
+        g = lin.g + lin.G @ d[-1]
+        short = feasibility.lacks(lin, options.terminal_tolerance, g).max(initial=0.0)
+        beyond = np.maximum(np.abs(g) - options.terminal_tolerance, 0.0)
+        return _Proposal(solution, beyond, radius, multiplier, step, length, float(short))
 
     def trust_weight(self) -> Array:
-        """Hessian blocks of ∫ E‖x − x_k‖² dt: those of the variance penalty, but for its weight."""
-        variance, weight = self.at.variance, self.options.variance_weight
-        if variance is None:
-            variance, weight = variance_of(self.model, self.at.lin, 1.0), 1.0
+        """Hessian blocks of ∫ E‖x − x_k‖² dt: those of the variance penalty with weight one."""
+        lin, dt = self.at.lin, self.model.dt
+        variance = variance_of(self.model, lin, 1.0, moments.adjoint_weights(lin.A, dt))
         assert variance is not None
-        return moments.trust_region_weight(variance.hessian / weight, self.model.dt)
+        return moments.trust_region_weight(variance.hessian, dt)
 
     def evaluate(self, proposal: _Proposal) -> _Candidate:
         """Where the step leads, lengthened or combined with others if they have become slow."""
@@ -287,30 +311,41 @@ class _Attempt:
         self, proposal: _Proposal, new: _Candidate, accepted: bool, seconds: tuple[float, float]
     ) -> Iteration:
         """A row of the history, with seconds of linearising and of solving."""
-        lin, variance, solution = new.at.lin, new.at.variance, proposal.solution
+        lin, variance, solution, units = (
+            new.at.lin,
+            new.at.variance,
+            proposal.solution,
+            self.model.units,
+        )
+        spread = np.nan if variance is None else variance.total / self.options.variance_weight
+        e, kappa = units.control * solution.e, units.cost
         return Iteration(
-            mean=lin.x, controls=lin.u,
-            effort=lin.effort, penalty=lin.penalty, running=lin.running,
-            variance=np.nan if variance is None else variance.total / self.options.variance_weight,
-            merit=new.merit, predicted=new.predicted, actual=new.actual, step=proposal.step,
-            trust_radius=proposal.radius, trust_multiplier=proposal.multiplier,
-            virtual_control=proposal.lacking,
-            defect=float(np.abs(lin.defect).max()),
-            terminal_residual=float(np.abs(lin.g).max(initial=0.0)),
-            terminal_multiplier=solution.terminal,
+            mean=units.state * lin.x, controls=units.control * lin.u,
+            effort=kappa * lin.effort, penalty=kappa * lin.penalty, running=kappa * lin.running,
+            variance=units.time * spread,
+            merit=kappa * new.merit, predicted=kappa * new.predicted, actual=kappa * new.actual,
+            step=float(np.vdot(self.model.original.dt[:, None] * e, e)),
+            trust_radius=proposal.radius, trust_multiplier=kappa * proposal.multiplier,
+            virtual_control=float(units.end @ proposal.beyond),
+            defect=float(np.abs(units.state * lin.defect).max()),
+            terminal_residual=float(np.abs(units.end * lin.g).max(initial=0.0)),
+            terminal_multiplier=kappa / units.end * solution.terminal,
             accepted=accepted, solver_iterations=solution.iterations,
             linearize_seconds=seconds[0], solve_seconds=seconds[1],
         )  # fmt: skip
 
     def outcome(self, status: Status, message: str = "") -> Outcome:
         """What has been reached, with controls that are admissible however it ended."""
-        model, weight, lin = self.model, self.options.variance_weight, self.at.lin
+        units, model, asked = self.model.units, self.model.original, self.asked
+        x, u = units.state * self.at.lin.x, model.admissible(units.control * self.at.lin.u)
+        x[0] = model.start
+        lin = linearize(model, x, u)
         if status is Status.INFEASIBLE:
-            named = feasibility.what_lacks(lin, self.options.terminal_tolerance)
+            named = feasibility.what_lacks(lin, asked.terminal_tolerance)
             message = f"the terminal condition is out of reach; nearest path: {named}"
-        if not status.ok and not np.array_equal(inside := model.admissible(lin.u), lin.u):
-            lin = linearize(model, lin.x, inside)
+        kappa = units.cost
         return Outcome.at(
-            lin, model, weight, status=status, adjoint=self.adjoint, terminal=self.terminal,
-            history=tuple(self.history), trust_multiplier=self.trust_multiplier, message=message,
+            lin, model, asked.variance_weight, status=status, history=tuple(self.history),
+            adjoint=kappa / units.state * self.adjoint, terminal=kappa / units.end * self.terminal,
+            trust_multiplier=kappa * self.trust_multiplier, message=message,
         )  # fmt: skip

@@ -215,7 +215,7 @@ def variance_of(
         return None
     d_sigma = np.asarray(model.diffusion_jacobian(model.times[:-1], at.x[:-1]))
     if Lambda is None:
-        Lambda = moments.adjoint_weights(at.A, model.dt)
+        Lambda = moments.adjoint_weights(at.A, model.dt, model.metric)
     start = moments.start_share(at.A, Lambda, model.start_covariance)
     return moments.variance_penalty(weight, at.sigma, d_sigma, Lambda, model.dt, start)
 

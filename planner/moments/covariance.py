@@ -99,13 +99,16 @@ def trace_integral(S: Array, dt: Array) -> float:
     return float(np.einsum("k,kii", dt, S[1:]))
 
 
-def adjoint_weights(A: Array, dt: Array) -> Array:
-    """Λ_1..Λ_K, (K, n, n): what noise injected on arrival at node k+1 adds to ∫ tr Σ."""
+def adjoint_weights(A: Array, dt: Array, metric: Array | None = None) -> Array:
+    """Λ_1..Λ_K, (K, n, n): what noise injected on arrival at node k+1 adds to ∫ tr Σ.
+
+    A `metric` (n,) weighs the variances in the trace; None is ones.
+    """
     K, n = A.shape[:2]
-    eye, L = np.eye(n), np.empty((K, n, n))
-    L[K - 1] = dt[K - 1] * eye
+    M, L = np.eye(n) if metric is None else np.diag(metric), np.empty((K, n, n))
+    L[K - 1] = dt[K - 1] * M
     for k in range(K - 2, -1, -1):
-        L[k] = dt[k] * eye + congruence(A[k + 1], L[k + 1])
+        L[k] = dt[k] * M + congruence(A[k + 1], L[k + 1])
     return L
 
 

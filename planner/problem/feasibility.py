@@ -53,6 +53,27 @@ def terminal_force(model: Model, at: Linearization) -> float:
     the end at least cost takes W ν = γ, so ‖ν‖ ≥ ‖γ‖ / λ_max(W). This sets the scale of the
     terminal penalty, whatever the units of states and costs.
     """
+    _, W, missing = _reach(model, at)
+    strength = float(np.max(np.linalg.eigvalsh(W), initial=0.0)) if np.isfinite(W).all() else 0.0
+    return float(np.linalg.norm(missing)) / strength if strength > 0.0 else 0.0
+
+
+def least_push(model: Model, at: Linearization) -> Array:
+    """Changes of the controls, (K, m), that lead to the linearised end at least effort.
+
+    Zeros where the model is not finite; what is out of reach is left out (least squares).
+    """
+    pushed, W, missing = _reach(model, at)
+    if not (np.isfinite(W).all() and np.isfinite(missing).all()):
+        return np.zeros(at.u.shape)
+    scale = 1.0 / np.sqrt(W.diagonal() + TINY)
+    nu = scale * np.linalg.lstsq(scale[:, None] * W * scale, scale * missing, rcond=1e-10)[0]
+    force = np.einsum("kqi,q->ki", pushed, nu) / model.dt[:, None]
+    return -0.5 * np.linalg.solve(model.R, force.T).T
+
+
+def _reach(model: Model, at: Linearization) -> tuple[Array, Array, Array]:
+    """G Φ_k B_k of each control (K, q, m), the Gramian W (q, q), and what the end lacks (q,)."""
     Phi = np.empty((len(at.A), *at.G.shape))  # G Φ_k: what arrives at node k + 1 does at the end
     Phi[-1] = at.G
     for k in range(len(at.A) - 1, 0, -1):
@@ -60,8 +81,7 @@ def terminal_force(model: Model, at: Linearization) -> float:
     missing = at.g + np.einsum("kqi,ki->q", Phi, at.defect)
     pushed = Phi @ at.B
     W = np.einsum("kqi,ij,krj,k->qr", pushed, np.linalg.inv(2.0 * model.R), pushed, 1.0 / model.dt)
-    strength = float(np.max(np.linalg.eigvalsh(W), initial=0.0)) if np.isfinite(W).all() else 0.0
-    return float(np.linalg.norm(missing)) / strength if strength > 0.0 else 0.0
+    return pushed, W, missing
 
 
 def states_moved(at: Linearization) -> Array:

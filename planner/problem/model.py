@@ -104,6 +104,11 @@ class Model:
         return Jacobians(self.problem, self.state_dim, self.control_dim)
 
     @property
+    def metric(self) -> Array | None:
+        """What the variance of each state weighs in tr Σ, (n,); None is one."""
+        return None
+
+    @property
     def knows_jacobians(self) -> bool:
         """Whether derivatives of its functions were asked for."""
         return "jacobians" in vars(self)
