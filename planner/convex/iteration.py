@@ -235,7 +235,7 @@ class _Attempt:
         lin, solution = self.at.lin, proposal.solution
         x = lin.x.copy()
         x[1:] += solution.d
-        merit = Merit(solution, options.terminal_tolerance, self.rho)
+        merit = Merit(self.at, solution, options.terminal_tolerance, self.rho)
         before = merit(self.at)
         # Φ by the model, which leaves no defects; the literal one holds only changes of penalties.
         constant = self.at.smooth_cost + (0.0 if self.composite else lin.penalty)

@@ -7,7 +7,8 @@ with f the defects of the non-linear dynamics, g the terminal residual (beyond i
 λ, ν their multipliers from the sub-problem. Pricing them by multipliers, with their signs, is
 what keeps good steps from being rejected near the solution (Maratos): the defect that a step
 leaves is of second order, and so is its gain. While something is lacking (ν at its limit ρ) the
-last two terms are ρ ‖g‖₁.
+last two terms are ρ ‖g‖₁. The noise is charged by the weights Λ that the sub-problem holds: with
+others its fixed point would not be a minimum of Φ.
 """
 
 from __future__ import annotations
@@ -50,9 +51,10 @@ def iterate_at(model: Model, variance_weight: float, x: Array, u: Array) -> Iter
 
 
 class Merit:
-    """Φ with the multipliers of a solution; τ of its terminal box and ρ of its penalty."""
+    """Φ with the multipliers of a solution from an iterate; τ of its box and ρ of its penalty."""
 
-    def __init__(self, solution: Solution, tolerance: float, rho: float) -> None:
+    def __init__(self, here: Iterate, solution: Solution, tolerance: float, rho: float) -> None:
+        self._noise = here.variance
         self.adjoint, self.terminal, self.tolerance = solution.adjoint, solution.terminal, tolerance
         self._largest = float(np.abs(solution.adjoint).max())
         size = float(np.abs(solution.terminal).max(initial=0.0))
@@ -66,7 +68,7 @@ class Merit:
         lin, beyond = at.lin, self._beyond(at.lin.g)
         defects = np.vdot(self.adjoint, lin.defect) + 0.5 * self._largest * np.abs(lin.defect).sum()
         end = np.vdot(self._nu, beyond) + self._terminal_price * np.abs(beyond).sum()
-        return at.smooth_cost + lin.penalty + float(defects + end)
+        return self._cost(lin) + float(defects + end)
 
     @_quiet
     def lagrangian(self, at: Iterate) -> float:
@@ -79,7 +81,11 @@ class Merit:
         price = 50.0 * self._largest / (1.0 + float(np.abs(lin.x).max()))
         squares = price * (np.vdot(lin.defect, lin.defect) + np.vdot(beyond, beyond))
         prices = np.vdot(self.adjoint, lin.defect) + np.vdot(self.terminal, beyond)
-        return at.smooth_cost + lin.penalty + float(prices + squares)
+        return self._cost(lin) + float(prices + squares)
+
+    def _cost(self, lin: Linearization) -> float:
+        noise = 0.0 if self._noise is None else self._noise.at(lin.sigma)
+        return lin.effort + lin.penalty + lin.running + noise
 
     def _beyond(self, g: Array) -> Array:
         return g - np.minimum(np.maximum(g, -self.tolerance), self.tolerance)

@@ -108,6 +108,15 @@ class Subproblem:
         slope = self.r + np.matmul(adjoint[:, None], self.B)[:, 0]
         return slope if e is None else slope + np.matmul(self.R, e[..., None])[..., 0]
 
+    def adjoint_residual(self, d: Array, adjoint: Array, terminal: Array) -> float:
+        """How far λ_1..λ_K (K, n) and ν are off the adjoint equation at d, beside the largest λ."""
+        push = self.h * np.maximum(self.hinge_arguments(d), 0.0)
+        force = np.matmul(self.Q, d[..., None])[..., 0] + self.q - adjoint
+        force += np.matmul(push[:, None], self.a)[:, 0]
+        force[:-1] += np.matmul(adjoint[1:, None], self.A[1:])[:, 0]
+        force[-1] += self.G.T @ terminal
+        return float(np.abs(force).max()) / (1.0 + float(np.abs(adjoint).max()))
+
     def response(self, e: Array) -> Array:
         """Deviations of nodes 1..K under control deviations e (K, m): (K, n)."""
         d = np.empty_like(self.f)

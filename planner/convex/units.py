@@ -5,7 +5,7 @@ Trust regions, merits and the tolerances of solvers compare numbers of different
     x = s z,   u = c v,   t = T θ,   cost = κ J,   g = γ h
 
 where s is how far the states move, c the controls that this takes, T the horizon, κ the effort
-of those controls and γ what the end moves when the states do, the problem in z, v, θ, J and h is
+of those controls or what the states' costs change by if that is more, and γ what the end moves when the states do, the problem in z, v, θ, J and h is
 the same whatever units it was written in.
 """
 
@@ -16,14 +16,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from slipcar.planner.convex.subproblem import convexify
 from slipcar.planner.problem.feasibility import TINY, end_sizes, least_push, states_moved
 from slipcar.planner.problem.linearization import linearize
 from slipcar.planner.problem.model import Model
 
 Array = np.ndarray
 
-#: A state that does not move has a size of this part of its value.
-_AT_REST = 1e-2
+#: A state that moves by less than a part of its value is at rest: its size is a part of the value.
+_AT_REST, _OF_VALUE = 1e-5, 1e-2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,13 +167,18 @@ def natural_units(model: Model, x: Array, u: Array, *, box: bool) -> Units:
         size = min((each for each in limits if 0.0 < each < np.inf), default=1.0)
     control = size * rates
     moved = np.maximum(states_moved(lin), _moves(lin.A, lin.B, push))
-    state = np.maximum(moved, _AT_REST * np.abs(x).max(axis=0))
+    value = np.abs(x).max(axis=0)
+    state = np.where(moved > _AT_REST * value, moved, _OF_VALUE * value)
     state = np.where(np.isfinite(state) & (state > TINY**0.5), state, 1.0)
     end = end_sizes(lin.G, state)
     end = np.where(np.isfinite(end) & (end > TINY**0.5), end, 1.0)
     if box:
         end = np.full(len(end), end.max(initial=0.0) or 1.0)
-    return Units(state, control, T, T * size**2, end)
+    sub = convexify(model, lin, variance=None)
+    hinges = np.matmul((sub.h * np.maximum(sub.b, 0.0))[:, None], sub.a)[:, 0]
+    charged = float(np.abs(sub.q + hinges).sum(axis=0) @ state)
+    cost = max(T * size**2, charged if np.isfinite(charged) else 0.0)
+    return Units(state, control, T, cost, end)
 
 
 def _moves(A: Array, B: Array, push: Array) -> Array:

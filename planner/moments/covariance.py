@@ -41,13 +41,19 @@ class Variance:
         value: what the noise adds to it at the iterate; all of it where the start is known.
         gradient: with respect to the states at nodes 0..K−1, (K, n).
         hessian: positive semidefinite, (K, n, n).
+        weights: w dt Λ_{k+1} of node k, held in steps as A is, (K, n, n).
         start: what the start's covariance adds to it, held in steps as A is.
     """
 
     value: float
     gradient: Array
     hessian: Array
+    weights: Array
     start: float = 0.0
+
+    def at(self, sigma: Array) -> float:
+        """What another diffusion (K, n, d) adds to it, by the same weights."""
+        return float(np.vdot(self.weights @ sigma, sigma))
 
     @property
     def total(self) -> float:
@@ -140,6 +146,7 @@ def variance_penalty(
         value=float(np.vdot(against, sigma)),
         gradient=2.0 * np.matmul(against.reshape(K, 1, n * d), tall)[:, 0],
         hessian=2.0 * np.matmul(tall.swapaxes(1, 2), curved),
+        weights=weighted,
         start=weight * start,
     )
 

@@ -178,7 +178,7 @@ def _convex(task: Task, options: Options) -> Outcome:
 
 
 def _certified(task: Task, options: Options, outcome: Outcome) -> Outcome:
-    """A converged outcome with the adjoint that proves it; MAX_ITERATIONS where none does."""
+    """A converged outcome with the adjoint that proves it; STALLED where none does."""
     if outcome.status is not Status.CONVERGED:
         return outcome
     off = violations(
@@ -187,7 +187,11 @@ def _certified(task: Task, options: Options, outcome: Outcome) -> Outcome:
     )  # fmt: skip
     if off.maximality <= math.sqrt(options.tolerance):
         return dataclasses.replace(outcome, adjoint=off.adjoint)
-    return dataclasses.replace(outcome, status=Status.MAX_ITERATIONS)
+    stalled = dataclasses.replace(outcome, status=Status.STALLED)
+    return stalled.said(
+        f"steps are short, but the maximum principle holds to {off.maximality:.2g} only, not "
+        f"{math.sqrt(options.tolerance):.2g}"
+    )
 
 
 def _convex_once(task: Task, options: Options) -> Outcome:

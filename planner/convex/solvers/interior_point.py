@@ -10,7 +10,7 @@ s z = μ → 0; linearised and eliminated, each only adds to the LQ problem's di
   row, G d − δ ν = s.
 
 Hinges are no inequalities: each step takes them as they are on at the last point. μ falls the
-faster the longer the last step was; the method stops at a gap of 1e-9 of the objective and leaves
+faster the longer the last step was; the method stops at a gap of 1e-11 of the objective and leaves
 the last digits to Newton's method.
 """
 
@@ -27,7 +27,7 @@ from slipcar.planner.lq.banded import PrimalDual
 Array = np.ndarray
 
 _MAX_STEPS = 100
-_GAP = 1e-9
+_GAP = 1e-11
 #: What is good enough to be polished when so many steps have brought nothing better.
 _ENOUGH, _IDLE = 1e-6, 8
 
@@ -103,12 +103,16 @@ def interior_point(sub: Subproblem, lq: LqProblem) -> tuple[PrimalDual | None, i
 
 
 def _error(sub: Subproblem, kinds: _ByKind, state: _State, size: Array, scale: float) -> float:
-    """The gap relative to the cost, or what a condition lacks relative to its size."""
+    """The gap relative to the cost, or what a condition lacks relative to its size.
+
+    Hinges were taken as they were on before: that is checked in the adjoint equation.
+    """
     point, s = state.point, kinds.split(state.s)
     residual = sub.G @ point.d[-1] + sub.g - state.w - s.plus + s.minus
     off = float(np.max(np.abs(residual) / size, initial=0.0))
     if s.ball.size:
         off = max(off, float(np.max(np.abs(s.ball + _passed(sub, point.e)))) / sub.radius)
+    off = max(off, sub.adjoint_residual(point.d, point.adjoint, point.terminal))
     return max(state.gap() / max(scale, abs(sub.objective(point.d, point.e))), off)
 
 
