@@ -4,9 +4,9 @@ Trust regions, merits and the tolerances of solvers compare numbers of different
 
     x = s z,   u = c v,   t = T θ,   cost = κ J,   g = γ h
 
-where s is how far the states move, c the controls that this takes, T the horizon, κ the effort
-of those controls or what the states' costs change by if that is more, and γ what the end moves when the states do, the problem in z, v, θ, J and h is
-the same whatever units it was written in.
+where s is how far the states move, c the controls that this takes, T the horizon, κ the effort of
+those controls or, if that is more, what the states' costs change by, and γ what the end moves when
+the states do, the problem in z, v, θ, J and h is the same whatever units it was written in.
 """
 
 from __future__ import annotations

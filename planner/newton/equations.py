@@ -47,6 +47,8 @@ Array = np.ndarray
 Rows = Any  # SymbolRows or NumberRows
 
 
+#: So much of the terms of a sum is rounding.
+_LAST_DIGITS = 4e-16
 #: What the iteration tells its kernels, entries of the row `knob`:
 KNOBS = (
     "alpha",  # length of the step that `shift` takes
@@ -279,7 +281,11 @@ class Equations:
         p = self.problem.at(rows)
         effort, running, charged, pull, gap, defect, penalty = carried["sums"]
         self._switch(rows, p.c)
-        for name, value in (("c", p.c), ("C", p.C), ("g", p.g), ("G", p.G)):
+        # Less than the rounding of what g is put together from is nothing: a condition that no
+        # control moves is then met.
+        rounding = _LAST_DIGITS * magnitude(p.G).dot(magnitude(rows["x"]))
+        g = choose(magnitude(p.g) - rounding, p.g, 0.0 * p.g)
+        for name, value in (("c", p.c), ("C", p.C), ("g", g), ("G", p.G)):
             rows.write(name, value)
         if p.state_cost:
             rows.write("H_xx", p.H_xx)
@@ -287,11 +293,11 @@ class Equations:
         charged = charged + row_cost
         miss, residual = 0.0, 0.0
         if self.form.soft:
-            charged = charged + (rows["W"] * p.g).dot(p.g)
+            charged = charged + (rows["W"] * g).dot(g)
         else:
-            pull = pull + rows["nu"].dot(p.g)
-            miss = magnitude(rows["nu"]).dot(magnitude(p.g))
-            residual = riccati.largest(p.g, 0.0)
+            pull = pull + rows["nu"].dot(g)
+            miss = magnitude(rows["nu"]).dot(magnitude(g))
+            residual = riccati.largest(g, 0.0)
         evaluation = Evaluation(
             effort=effort, running=running + rows["dn"] * p.H, charged=charged, pull=pull, gap=gap,
             miss=miss, defect=defect, residual=residual, penalty=penalty + mean_cost,

@@ -241,7 +241,12 @@ def _explained(model: Model, options: Options, outcome: Outcome) -> Outcome:
         return outcome.said(not_finite(model, outcome.x, outcome.u, "where the iteration ended"))
     if far := what_lacks(at, options.terminal_tolerance):
         return outcome.said(f"the terminal condition is not met: {far}")
-    return outcome.said(
-        f"steps are not short yet; the mean is {inconsistency(at):.2g} of how far it moves off the "
-        f"controls' path"
-    )
+    why = {
+        Status.SOLVER_FAILED: "no step could be computed: its equations are singular or overflow",
+        Status.STALLED: "no step lowers the merit function any more",
+    }.get(outcome.status, "steps are not short yet")
+    off = inconsistency(at)
+    if off <= _NEARLY:
+        return outcome.said(why)
+    far = f"{off:.2g} of how far it moves" if np.isfinite(off) else "farther than numbers go"
+    return outcome.said(f"{why}; the mean is {far} off the path of the controls")

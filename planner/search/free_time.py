@@ -35,10 +35,12 @@ Array = np.ndarray
 #: The first Δ and its largest value, relative to T; how it shrinks and grows.
 _FIRST_RADIUS, _LARGEST_RADIUS, _SHRINK, _GROW = 0.2, 0.5, 0.25, 2.0
 #: Stop when a step is this short relative to T, or the transversality residual this small
-#: relative to the mean cost per time; give up after so many plans.
-_SHORTEST, _TRANSVERSALITY, _PLANS = 1e-9, 1e-9, 40
-#: Tolerance of the plans: the slope is only as good as the plan it is taken at.
-_PRECISE = 1e-16
+#: relative to the mean cost per time; give up after so many plans, or where none was found in so
+#: many times the iterations that one may take.
+_SHORTEST, _TRANSVERSALITY, _PLANS, _IN_VAIN = 1e-9, 1e-9, 40, 2
+#: Tolerance of the plans (the slope is only as good as the plan it is taken at), by Newton's
+#: method and by the convex scheme, which converges linearly.
+_PRECISE, _PRECISE_CONVEX = 1e-16, 1e-12
 #: Relative accuracy of V + c T: below it the slope decides.
 _NOISE = 1e-7
 #: How much longer the horizon becomes where none was planned yet.
@@ -84,7 +86,8 @@ def free_final_time(
     """
     if nominal.status is Status.STOPPED:
         return model, nominal, ()
-    precise = dataclasses.replace(options, tolerance=min(options.tolerance, _PRECISE))
+    finest = _PRECISE_CONVEX if posed is None else _PRECISE
+    precise = dataclasses.replace(options, tolerance=min(options.tolerance, finest))
     search = _Search(model, posed, precise, time_weight, bounds)
     best, settled = search.planned(nominal), False
     if best.outcome.status.ok:
@@ -137,7 +140,8 @@ class _Search:
             point = self._at(T, nominal.x, nominal.u)
             self._add(point, True)
             ended = point.outcome.status.ok or point.outcome.status is Status.STOPPED
-            if ended or self.bounds[1] <= T or len(self.steps) > _PLANS:
+            spent = sum(step.iterations for step in self.steps)
+            if ended or self.bounds[1] <= T or spent >= _IN_VAIN * self.options.max_iterations:
                 return point
             T = min(_LONGER * T, self.bounds[1])
 

@@ -148,7 +148,11 @@ def _charges_noise(problem: Own, p: Plan) -> bool:
 
 
 def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]:
-    """The same problem where all is of order one has the same status and cost."""
+    """The same problem where all is of order one ends alike, and costs the same.
+
+    How an iteration fails that leads nowhere (STALLED, MAX_ITERATIONS, INFEASIBLE) may turn on
+    rounding.
+    """
     if recipe.plain == recipe:
         return []
     plain = Own(recipe.plain)
@@ -156,7 +160,7 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     if other.error is not None:
         return [f"refused where all is of order one: {other.error}"]
     q, C = other.value, Own(recipe).C
-    if p.status is not q.status:
+    if p.status.ok is not q.status.ok:
         return [f"{p.status.name}, but {q.status.name} where all is of order one"]
     if p.status.ok and not abs(p.cost / C - q.cost) <= 1e-3 * (abs(q.cost) + q.effort) + 1e-9:
         return [f"cost {p.cost / C:.6g}, but {q.cost:.6g} where all is of order one"]
