@@ -27,8 +27,8 @@ class Iteration:
     predicted: float  #: decrease of Φ by the model
     actual: float  #: decrease of Φ
     step: float  #: ∫ ‖u_{k+1} − u_k‖² dt
-    trust_radius: float  #: ∫ E‖x − x_k‖² dt, of the problem's size but for the paper's trust
-    #: region; its mean's part alone while no trust region acts
+    trust_radius: float  #: ∫ E‖x − x_k‖² dt, in units of the problem's size where the trust
+    #: region is adaptive; its mean's part alone while no trust region acts
     trust_multiplier: float  #: −p¹ with p⁰ = −1
     virtual_control: float  #: what the sub-problem's terminal condition lacks, 1-norm
     defect: float  #: largest |x_k + dt b(x_k, u_k) − x_{k+1}|

@@ -14,8 +14,8 @@ act from when steps have become short. Should the iteration settle all the same 
 condition cannot be met, it is run once more, with limits and short steps from the beginning. At
 the end, where convergence is linear, steps are lengthened or combined (:mod:`.acceleration`).
 
-All of this happens in units of the problem's own size (:mod:`.units`); only the paper's trust
-region, which is a number of the user's, is in the user's.
+Under the adaptive trust region all of this happens in units of the problem's own size
+(:mod:`.units`); the paper's, which is a number of the user's, is in the user's.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def iterate(
         ValueError: if the model functions are not finite along the guess.
     """
     box = options.terminal_tolerance > 0.0
-    units = identity_units(model, x) if trust.limits_radius else natural_units(model, x, u, box=box)
+    units = natural_units(model, x, u, box=box) if trust.scaled else identity_units(model, x)
     there = scaled(model, units)
     bold = _Attempt(there, solver, trust, options, x, u).run()
     left = options.max_iterations - len(bold.history)

@@ -39,6 +39,7 @@ class TrustRegion:
     collapsed = False  # no acceptable step is to be expected any more
     limits_radius = False  # `fits` looks at the radius: measure it in full, whatever the multiplier
     accelerates = False  # steps may be lengthened or combined where they converge slowly
+    scaled = False  # in units of the problem's size, not the user's
 
     def cautious(self, multiplier: float) -> TrustRegion | None:
         """A fresh schedule for a second attempt whose steps are short from the first, if any."""
@@ -103,11 +104,11 @@ class AdaptiveTrustRegion(TrustRegion):
     rises when one is rejected or barely pays and falls after good ones.
     """
 
-    accelerates = True
+    accelerates = scaled = True
 
     def __init__(self, free: int = 25, patience: int = 30, multiplier: float = 0.0) -> None:
         self.multiplier, self.bold = multiplier, free > _WITHIN_BOUNDS
-        self._free, self._patience, self._was_free = free, patience, free > 0
+        self.free, self._patience, self._was_free = free, patience, free > 0
         self._rejected = 0
 
     def cautious(self, multiplier: float) -> AdaptiveTrustRegion | None:
@@ -116,9 +117,9 @@ class AdaptiveTrustRegion(TrustRegion):
 
     def judge(self, step: Step) -> bool:
         """Accept or reject, and adapt the multiplier."""
-        self._free -= 1
-        self.bold = self._free > _WITHIN_BOUNDS
-        if self._free >= 0 and step.actual > -math.inf:
+        self.free -= 1
+        self.bold = self.free > _WITHIN_BOUNDS
+        if self.free >= 0 and step.actual > -math.inf:
             return True
         # The multiplier that makes the penalty as large as what the step promised.
         natural = step.predicted / max(step.radius, 1e-300)

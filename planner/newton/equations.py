@@ -284,7 +284,7 @@ class Equations:
         # Less than the rounding of what g is put together from is nothing: a condition that no
         # control moves is then met.
         rounding = _LAST_DIGITS * magnitude(p.G).dot(magnitude(rows["x"]))
-        g = choose(magnitude(p.g) - rounding, p.g, 0.0 * p.g)
+        g = choose(rounding - magnitude(p.g), 0.0 * p.g, p.g)
         for name, value in (("c", p.c), ("C", p.C), ("g", g), ("G", p.G)):
             rows.write(name, value)
         if p.state_cost:

@@ -20,7 +20,7 @@ import numpy as np
 
 from slipcar.planner.convex import iteration
 from slipcar.planner.convex.solvers.registry import make_solver
-from slipcar.planner.convex.trust_region import TRUST_REGIONS
+from slipcar.planner.convex.trust_region import TRUST_REGIONS, AdaptiveTrustRegion
 from slipcar.planner.extremal.certificate import violations
 from slipcar.planner.newton.posing import Posed, check_assumptions, pose
 from slipcar.planner.newton.running import solve_mean
@@ -39,7 +39,7 @@ Array = np.ndarray
 
 #: Newton's method has so many iterations to itself, and this part of those beyond; each way that
 #: follows has this part of what is left.
-_OWN, _SHARED = 60, 0.5
+_OWN, _SHARED = 60, 0.4
 #: The convex scheme stops on its steps: times that it goes on with smaller ones, each a hundredth,
 #: until the maximum principle holds.
 _REFINED = 3
@@ -56,6 +56,7 @@ class Task:
     x: Array  #: guess, (N, n)
     u: Array  #: guess, (K, m)
     free_first: bool = False  #: whether to leave penalties out at first
+    bold_steps: int | None = None  #: steps that the convex scheme takes whole; None is its default
     label: str = ""  #: for people
 
 
@@ -108,8 +109,9 @@ def attempt(task: Task, options: Options, *, history: bool = True) -> Outcome:
         limit = int(_SHARED * left)
         if limit <= 0:
             break
-    if left > 0 and not _feasible(task.model, options, _best(task.model, options, ended)):
-        second = dataclasses.replace(task, free_first=False)
+    best = _best(task.model, options, ended)
+    if left > 0 and not _feasible(task.model, options, best):
+        second = dataclasses.replace(task, x=best.x, u=best.u, free_first=False, bold_steps=0)
         ended.append(_convex(second, options.with_iterations(left)))
         if ended[-1].status in (Status.CONVERGED, Status.STOPPED, Status.INFEASIBLE):
             return _joined(ended)
@@ -204,7 +206,7 @@ def _convex_once(task: Task, options: Options) -> Outcome:
             return dataclasses.replace(free, penalty=penalty, objective=free.objective + penalty)
         x, u, before = free.x, free.u, tuple(free.history)
         options = options.with_iterations(max(1, options.max_iterations - len(before)))
-    outcome = _iterate(model, options, x, u)
+    outcome = _iterate(model, options, x, u, task.bold_steps)
     history = (*before, *outcome.history)
     return dataclasses.replace(outcome, iterations=len(history), history=history)
 
@@ -226,9 +228,13 @@ def _without_penalties(model: Model, options: Options, x: Array, u: Array) -> Ou
     return dataclasses.replace(outcome, status=status)
 
 
-def _iterate(model: Model, options: Options, x: Array, u: Array) -> Outcome:
+def _iterate(
+    model: Model, options: Options, x: Array, u: Array, bold_steps: int | None = None
+) -> Outcome:
     solver = make_solver(options.solver) if isinstance(options.solver, str) else options.solver
     trust = TRUST_REGIONS[options.trust_region or "adaptive"]()
+    if isinstance(trust, AdaptiveTrustRegion) and bold_steps is not None:
+        trust = AdaptiveTrustRegion(min(bold_steps, trust.free))
     return iteration.iterate(model, solver, trust, options, x, u)
 
 
