@@ -5,8 +5,8 @@ Trust regions, merits and the tolerances of solvers compare numbers of different
     x = s z,   u = c v,   t = T θ,   cost = κ J,   g = γ h
 
 where s is how far the states move, c the controls that this takes, T the horizon, κ the effort of
-those controls or, if that is more, what the states' costs change by, and γ what the end moves when
-the states do, the problem in z, v, θ, J and h is the same whatever units it was written in.
+those controls (or a part of what the states' costs change by) and γ what the end moves when the
+states do, the problem in z, v, θ, J and h is the same whatever units it was written in.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ Array = np.ndarray
 
 #: A state that moves by less than a part of its value is at rest: its size is a part of the value.
 _AT_REST, _OF_VALUE = 1e-5, 1e-2
+#: The effort is the unit of cost unless it is less than this part of what states cost.
+_LEAST_EFFORT = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,7 +179,7 @@ def natural_units(model: Model, x: Array, u: Array, *, box: bool) -> Units:
     sub = convexify(model, lin, variance=None)
     hinges = np.matmul((sub.h * np.maximum(sub.b, 0.0))[:, None], sub.a)[:, 0]
     charged = float(np.abs(sub.q + hinges).sum(axis=0) @ state)
-    cost = max(T * size**2, charged if np.isfinite(charged) else 0.0)
+    cost = max(T * size**2, _LEAST_EFFORT * charged if np.isfinite(charged) else 0.0)
     return Units(state, control, T, cost, end)
 
 

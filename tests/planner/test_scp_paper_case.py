@@ -116,22 +116,21 @@ def test_literal_linearisation_never_settles_under_the_papers_schedule(paper):
     assert min(h.step for h in p.history[-10:]) > 1.0  # it still jumps at the end
 
 
-def test_literal_linearisation_converges_in_the_adaptive_trust_region(paper, exact_paper_plan):
-    # From near by: its first steps jump, and where they land from afar is another way round.
-    near = (exact_paper_plan.mean, 0.8 * exact_paper_plan.controls)
+def test_literal_linearisation_converges_in_the_adaptive_trust_region(paper):
+    # Its first steps jump: where they land may be another way round than the best one.
     p = plan(
         paper,
         variance_weight=0.0,
-        guess=near,
         linearization="literal",
         trust_region="adaptive",
         tolerance=1e-6,
         max_iterations=300,
     )
     assert p.status is Status.CONVERGED
-    assert p.cost == pytest.approx(exact_paper_plan.cost, rel=1e-4)
-    np.testing.assert_allclose(p.controls, exact_paper_plan.controls, atol=0.03)
     assert any(not h.accepted for h in p.history)
+    exact = plan(paper, variance_weight=0.0, guess=p, tolerance=1e-12)
+    assert p.cost == pytest.approx(exact.cost, rel=1e-4)
+    np.testing.assert_allclose(p.controls, exact.controls, atol=0.03)
 
 
 @pytest.mark.parametrize("trust_region", ["adaptive", "paper", "none"])
