@@ -20,6 +20,7 @@ from pathlib import Path
 from slipcar.baselines.pathwise_config import PathwiseConfig
 from slipcar.baselines.policy import ACTION_DIM, Policy
 from slipcar.baselines.progress import Progress
+from slipcar.envs.extras import install
 from slipcar.envs.options import layout_for
 from slipcar.envs.sources import Source, base_of, source_of
 from slipcar.envs.validate import checked_int
@@ -70,7 +71,7 @@ def train_pathwise(
         from slipcar.baselines.pathwise_training import train
     except ImportError as error:
         raise ImportError(
-            f"training needs torch and tqdm ({error}): pip install 'slipcar[rl]'"
+            f"training needs torch and tqdm ({error}): {install('rl')}"
         ) from error
     sizes = (layout.size, *config.hidden, ACTION_DIM)
     if initial is not None and (initial.layout, initial.sizes) != (layout, sizes):

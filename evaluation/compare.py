@@ -249,7 +249,7 @@ class Comparison(ComparisonRecord):
 
         Args:
             folder: made if it does not exist.
-            figures: also draw them (PNG and PDF; needs matplotlib, `pip install slipcar[plot]`).
+            figures: also draw them (PNG and PDF; needs matplotlib).
 
         Returns:
             The files written.

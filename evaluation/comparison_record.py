@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slipcar.envs.scenario import Scenario
-from slipcar.evaluation.metrics import Result
+from slipcar.evaluation.metrics import Result, leading
+from slipcar.evaluation.statistics import Leader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,6 +72,11 @@ class ComparisonRecord:
         columns = list(dict.fromkeys(key for row in rows.values() for key in row if key != "error"))
         frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns, "error"])
         return frame.rename_axis("controller")
+
+    @functools.cached_property
+    def leaders(self) -> dict[str, Leader | None]:
+        """Who has the least mean cost, and the fewest collisions at and between nodes; who ties."""
+        return {name: leading(self.results, name) for name in DIFFERENCES.values()}
 
     def _differences(self, name: str) -> dict[str, float]:
         found: dict[str, float] = {}

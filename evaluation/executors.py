@@ -27,6 +27,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
+from slipcar.envs.extras import install
 from slipcar.envs.validate import checked_int
 from slipcar.evaluation.provenance import code_digest, versions
 from slipcar.evaluation.threads import ENVIRONMENT, one_thread
@@ -237,7 +238,7 @@ def open_executor(workers: int = 1, cluster: str | None = None) -> Iterator[Exec
         import distributed
     except ImportError as error:
         raise ImportError(
-            f"cluster={cluster!r} needs Dask ({error}): pip install 'slipcar[cluster]'"
+            f"cluster={cluster!r} needs Dask ({error}): {install('cluster')}"
         ) from error
     with contextlib.ExitStack() as stack:
         if address:

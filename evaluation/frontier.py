@@ -231,7 +231,7 @@ class Frontier(FrontierRecord):
 
         Args:
             folder: made if it does not exist.
-            figures: also draw `frontier.png` and `.pdf` (`pip install slipcar[plot]`).
+            figures: also draw `frontier.png` and `.pdf` (needs matplotlib).
 
         Returns:
             The files written.

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.statistics import (
     Interval,
+    Leader,
     cvar,
+    leader,
     paired_difference,
     quantile,
     rate_interval,
@@ -25,6 +27,8 @@ CLEARANCE_QUANTILES = (0.01, 0.05, 0.5)
 COST_QUANTILES = (0.5, 0.95, 0.99)
 #: Metrics that are 0 or 1, or between.
 RATES = ("collision", "touched")
+#: So many standard errors apart no bootstrap is needed to tell which mean is less.
+_FAR = 10.0
 #: Share of the worst episodes that a conditional value at risk averages.
 TAIL = 0.05
 
@@ -366,6 +370,22 @@ class Result:
             _, lower, higher = student_interval(float(values.mean()), error, freedom)
             low, high = max(0.0, min(low, lower)), min(1.0, max(high, higher))
         return low, high
+
+
+def leading(results: Mapping[str, Result], metric: str) -> Leader | None:
+    """Which row has the least mean of a metric, and which ties; by paired differences."""
+    means = {name: float(result.per_path(metric).mean()) for name, result in results.items()}
+
+    def difference(name: str, best: str) -> Interval:
+        row, reference = results[name], results[best]
+        n = min(row.episodes, reference.episodes)
+        paired = row.per_path(metric)[:n] - reference.per_path(metric)[:n]
+        error = standard_error(paired)
+        if not (row.runs or reference.runs) and paired.mean() > _FAR * error > 0.0:
+            return student_interval(float(paired.mean()), error, float("inf"))
+        return row.difference(reference, metric)
+
+    return leader(means, difference)
 
 
 def _together(paths: float, trainings: float) -> float:

@@ -29,7 +29,7 @@ class CvxpySolver:
         chosen = solver or next((name for name in _SOLVERS if name in installed), None)
         if chosen is None:
             raise ImportError(
-                f'cvxpy has none of {list(_SOLVERS)} installed: pip install "slipcar[qp]"'
+                f"cvxpy has none of {list(_SOLVERS)} installed: pip install clarabel"
             )
         self.solver = chosen
 
