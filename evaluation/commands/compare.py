@@ -271,7 +271,7 @@ def _finish(
     out = output.console()
     written: list[Path] = []
     try:
-        with out.status("writing tables and drawing figures ..."):
+        with output.busy("writing tables and drawing figures ..."):
             written = save()
     finally:
         out.print(shown())

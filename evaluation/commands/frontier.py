@@ -88,7 +88,7 @@ def frontier(
             f"finished points are kept in {folder}; run the command again to continue"
         ) from None
     out = output.console()
-    with out.status("writing tables and drawing the figure ..."):
+    with output.busy("writing tables and drawing the figure ..."):
         written = done.save(folder, figures=figures)
     out.print(report_frontier.terminal(done))
     say_written(out, written, folder)

@@ -7,6 +7,7 @@ import json as json_text
 import os
 import sys
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,6 +40,12 @@ class Output:
         from rich.console import Console
 
         return Console(quiet=True) if self.quiet or self.json else console()
+
+    def busy(self, text: str) -> AbstractContextManager[object]:
+        """Say on the standard error, while something lasts, what it is."""
+        from rich.console import Console
+
+        return Console(stderr=True, quiet=self.quiet).status(text)
 
     def data(self, value: Any) -> None:
         """Print plain data, where JSON is wanted; nan and infinities are null there."""

@@ -71,7 +71,7 @@ def reproduce(
             progress=lambda what, share: bar.update(task, completed=share, description=what),
         )
     out = output.console()
-    with out.status("writing tables and drawing figures ..."):
+    with output.busy("writing tables and drawing figures ..."):
         written = done.save(folder, figures=figures)
         if docs is not None:
             from slipcar.evaluation.reproduction import page as reproduce_page

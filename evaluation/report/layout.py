@@ -11,7 +11,7 @@ import dataclasses
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from slipcar.evaluation.report.table import Table
 
@@ -85,15 +85,23 @@ def lines(table: Table, width: int) -> Iterator[Text]:
 def broken(text: str, width: int) -> list[str]:
     """Text in lines of at most `width`; what belongs to one number stays together.
 
-    A word that is longer is broken anywhere.
+    Where there is no room for all of that it is broken between its words, a longer word anywhere.
     """
-    parts = textwrap.wrap(_kept(text), width, break_on_hyphens=False) or [""]
-    return [part.replace(_TIE, " ") for part in parts]
+    options: Any = {"width": max(1, width), "break_on_hyphens": False}
+    found: list[str] = []
+    for part in textwrap.wrap(_kept(text), break_long_words=False, **options):
+        part = part.replace(_TIE, " ")
+        found += [part] if len(part) <= width else textwrap.wrap(part, **options)
+    return found or [""]
 
 
 def _kept(text: str) -> str:
-    """Numbers keep their sign, error and unit: "≤ 0.1 %", "5.038 ± 0.010"."""
-    return re.sub(r"(?<=[≤≥<>±=]) (?=[\d.+-])|(?<=\d) (?=[±%])", _TIE, text)
+    """Numbers keep sign, error, unit and interval: "≤ 0.1 %", "5.0 ± 0.1", "1.0 [0.8, 1.2]"."""
+    return re.sub(
+        r"(?<=[≤≥<>±=]) (?=[\d.+-])|(?<=\d) (?=[±%])|(?<=\d) (?=\[[\d+-])|(?<=\d,) (?=[^ ]*\])",
+        _TIE,
+        text,
+    )
 
 
 def _words(text: str) -> int:

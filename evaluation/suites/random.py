@@ -122,6 +122,8 @@ def _winner(result: SuiteResult, frame: pd.DataFrame, metric: str) -> list[bool]
 
     Who gave up the hard worlds is no rival of those who drove them.
     """
+    if metric not in result.frame:  # every row raised
+        return [False] * len(frame)
     cells = result.frame.pivot(index="variant", columns="controller", values=metric)
     everywhere = frame.index[frame["worlds"] == frame["worlds"].max()]
     found = leader(
