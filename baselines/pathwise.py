@@ -70,9 +70,7 @@ def train_pathwise(
     try:
         from slipcar.baselines.pathwise_training import train
     except ImportError as error:
-        raise ImportError(
-            f"training needs torch and tqdm ({error}): {install('rl')}"
-        ) from error
+        raise ImportError(f"training needs torch and tqdm ({error}): {install('rl')}") from error
     sizes = (layout.size, *config.hidden, ACTION_DIM)
     if initial is not None and (initial.layout, initial.sizes) != (layout, sizes):
         raise ValueError(

@@ -213,7 +213,7 @@ def checked_prices(name: str, prices: Sequence[float]) -> list[float]:
     return sorted(found)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Frontier(FrontierRecord):
     """What :func:`frontier` returns: its record, and ways to write it.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from slipcar.evaluation.statistics import (
     student_interval,
     welch,
 )
+from slipcar.planner.display import brief, facts
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Quantiles that tables show: of the clearance, and of a path's cost.
 CLEARANCE_QUANTILES = (0.01, 0.05, 0.5)
@@ -59,6 +64,8 @@ class EpisodeMetrics:
     position_error: np.ndarray
     heading_error: np.ndarray
     speed_error: np.ndarray
+
+    __repr__ = brief
 
     @functools.cached_property
     def total(self) -> np.ndarray:
@@ -147,6 +154,40 @@ class Result:
     preparation_time: float
     wall_time: float
     runs: tuple[Result, ...] = ()
+
+    def __repr__(self) -> str:
+        known = self._facts()
+        said = [f"{known.pop('loop')} loop", f"{known.pop('episodes')} episodes"]
+        return f"Result({', '.join([*said, *(f'{name} {text}' for name, text in known.items())])})"
+
+    def _repr_html_(self) -> str:
+        return facts("Result", self._facts())
+
+    def _facts(self) -> dict[str, str]:
+        """What there is to say in a few words: name -> text."""
+        (low, high), (below, above) = self.collision_interval, self.between_interval
+        trainings = {"trainings": str(len(self.runs))} if self.runs else {}
+        return {
+            "loop": "closed" if self.closed_loop else "open",
+            "episodes": f"{self.episodes:,}",
+            **trainings,
+            "total cost": f"{self.total:.3f} ± {self.total_se:.3f}",
+            "collisions": f"{self.collision_rate:.2%} [{low:.2%}, {high:.2%}]",
+            "at or between nodes": f"{self.between_rate:.2%} [{below:.2%}, {above:.2%}]",
+            "position RMS": f"{self.position_rms:.4f} m",
+        }
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row an episode, every metric in SI units; with several trainings, a level for each."""
+        import pandas as pd
+
+        columns = self.metrics.to_dict() | {"total": self.metrics.total}
+        paths = range(self.episodes)
+        if not self.runs:
+            return pd.DataFrame(columns, index=pd.Index(paths, name="episode"))
+        levels = [range(len(self.runs)), paths]
+        index = pd.MultiIndex.from_product(levels, names=["training", "episode"])
+        return pd.DataFrame(columns, index=index)
 
     @classmethod
     def of_runs(cls, runs: Sequence[Result]) -> Result:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
+from html import escape
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from slipcar.envs.extras import install
 from slipcar.evaluation import learning
 from slipcar.evaluation.cells import controller_fingerprint
 from slipcar.evaluation.comparison_record import ComparisonRecord
+from slipcar.evaluation.report import text as report_text
 from slipcar.evaluation.report.document import Document, Figure, plain, write_texts
 from slipcar.evaluation.report.formats import (
     collisions,
@@ -314,6 +316,13 @@ def terminal(comparison: ComparisonRecord, all_tables: bool = True) -> Group:
     """For a terminal, to be printed by a rich console: the main table and what it says, or all."""
     shown = document(comparison, brief=True)
     return shown.terminal() if all_tables else shown.terminal(1, sentences(comparison))
+
+
+def html(comparison: ComparisonRecord) -> str:
+    """The main table and what it says, for a notebook."""
+    table, *_ = tables(comparison, brief=True)
+    said = (setting(comparison), *sentences(comparison), *messages(comparison))
+    return report_text.html_table(table) + "".join(f"<p>{escape(text)}</p>" for text in said)
 
 
 def json_text(comparison: ComparisonRecord, frame: pd.DataFrame | None = None) -> str:

@@ -6,6 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any, Protocol
 
 from slipcar.evaluation.report.layout import Fitted, Prose
@@ -157,6 +158,30 @@ _TEX = {
 def tex(text: str) -> str:
     """Text with what LaTeX would take as commands escaped."""
     return "".join(_TEX.get(letter, letter) for letter in text)
+
+
+def html_table(table: Table) -> str:
+    """A table in HTML, without script and with no style but its own; all of it is escaped."""
+    align = ["right" if table.numeric(j) else "left" for j in range(len(table.headers))]
+
+    def cell(i: int, j: int, text: str) -> str:
+        shown = f"<strong>{escape(text)}</strong>" if (i, j) in table.bold else escape(text)
+        kind = 'th scope="row"' if j == 0 else "td"
+        style = f'style="text-align:{align[j]};white-space:nowrap"'
+        return f"<{kind} {style}>{shown}</{kind[:2]}>"
+
+    head = "".join(
+        f'<th scope="col" style="text-align:{side}">{escape(header)}</th>'
+        for side, header in zip(align, table.headers, strict=True)
+    )
+    rows = "".join(
+        f"<tr>{''.join(cell(i, j, text) for j, text in enumerate(row))}</tr>"
+        for i, row in enumerate(table.cells)
+    )
+    return (
+        f'<table><caption style="text-align:left">{escape(table.caption)}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    )
 
 
 def terminal(document: Printed, tables: int | None = None, sentences: Sequence[str] = ()) -> Group:

@@ -45,3 +45,5 @@ class ReproductionRecord:
     agreement: Mapping[str, Agreement]
     solvers: Mapping[str, Mapping[str, Any]]
     provenance: Mapping[str, Any]
+
+    __repr__ = brief

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 EPISODES = 100_000
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Reproduction(ReproductionRecord):
     """What :func:`reproduce` returns: its record, and ways to write it.
 
