@@ -184,7 +184,7 @@ def check_request(
             f"between slashes, and a version -v0 at the end; not {dataset_id!r}"
         )
     _minari()
-    root = Path(folder) if folder is not None else _default_folder()
+    root = Path(folder).absolute() if folder is not None else _default_folder()
     path = root / dataset_id
     if _is_dataset(path) and not overwrite:
         raise ValueError(

@@ -10,7 +10,7 @@ import tyro
 
 from slipcar.evaluation.commands.checks import check_figures, check_folder
 from slipcar.evaluation.commands.inputs import PaperScenarioOption, read_maker, read_scenario
-from slipcar.evaluation.commands.output import Output, OutputOption, say_written
+from slipcar.evaluation.commands.output import Output, OutputOption, say, say_written
 from slipcar.evaluation.executors import LostWorkersError
 
 if TYPE_CHECKING:
@@ -276,10 +276,10 @@ def _finish(
     finally:
         out.print(shown())
         if not all_tables:
-            out.print(
+            say(
+                out,
                 f"All tables are in {folder / 'table.md'}; --all-tables prints them here, "
                 f"`slipcar report {folder}` makes a page of them.",
-                markup=False,
             )
         if written:
             say_written(out, written, folder)

@@ -98,7 +98,7 @@ def broken(text: str, width: int) -> list[str]:
 def _kept(text: str) -> str:
     """Numbers keep sign, error, unit and interval: "≤ 0.1 %", "5.0 ± 0.1", "1.0 [0.8, 1.2]"."""
     return re.sub(
-        r"(?<=[≤≥<>±=]) (?=[\d.+-])|(?<=\d) (?=[±%])|(?<=\d) (?=\[[\d+-])|(?<=\d,) (?=[^ ]*\])",
+        r"(?<=[≤≥<>±=]) (?=[\d.+-])|(?<=\d) (?=[±%])|(?<=[\d%]) (?=\[[\d+-])|(?<=\d,) (?=[^ ]*\])",
         _TIE,
         text,
     )
