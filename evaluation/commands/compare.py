@@ -196,7 +196,8 @@ def _paper(
     names = usual.chosen(list(usual.row_makers(world, **how)[0]), rows)
     against = _reference(reference, usual.REFERENCE, [*names, *own])
     check_names(names, list(own), len(controllers))
-    made, notes = usual.default_rows(world, **how, only=rows)
+    with output.busy("planning ..."):
+        made, notes = usual.default_rows(world, **how, only=rows)
     done = compare_controllers({**made, **own}, world, reference=against, notes=notes, **options)
     _finish(
         output,

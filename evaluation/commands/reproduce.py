@@ -52,6 +52,7 @@ def reproduce(
 
     columns = (
         progress.BarColumn(), progress.TaskProgressColumn(), progress.TimeElapsedColumn(),
+        progress.TextColumn("left"), progress.TimeRemainingColumn(),
         progress.TextColumn("{task.description}"),
     )  # fmt: skip
     if docs is not None and docs.suffix != ".md":
@@ -61,7 +62,9 @@ def reproduce(
     check_file(docs)
     check_folder(folder)
     check_figures(figures, "--no-figures")
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with progress.Progress(
+        *columns, console=Console(stderr=True), transient=True, disable=output.quiet
+    ) as bar:
         task = bar.add_task("", total=1.0)
         done = compute(
             episodes,

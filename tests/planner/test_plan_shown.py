@@ -108,7 +108,7 @@ def test_a_plane_is_drawn_into_the_axes_it_is_given(drive, pyplot):
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["mean"].get_xydata(), drive.mean[:, :2])
     assert len(axes.patches) == 2 * len(drive.problem.obstacles)  # with their clearance
-    assert axes.get_xlabel() == "$r_x$ [m]" or axes.get_xlabel() == "r_x [m]"
+    assert axes.get_xlabel() == "r_x [m]"
     own = drive.plot()
     assert own.figure is not axes.figure
 
@@ -171,7 +171,7 @@ def test_a_frame_has_a_row_a_node(drive, glide):
     np.testing.assert_array_equal(frame["a_v [m/s²]"][:-1], drive.controls[:, 0])
     assert np.isnan(frame["a_v [m/s²]"].iloc[-1])
     assert list(glide.to_frame()) == ["x[0]", "x[1]", "sd of x[0]", "sd of x[1]", "u[0]"]
-    assert list(plan(Named(), variance_weight=0.0).to_frame())[0] == "height [m]"
+    assert "height [m]" in plan(Named(), variance_weight=0.0).to_frame()
 
 
 def test_wrong_names_are_named():
@@ -188,9 +188,8 @@ def test_a_dataset_has_named_dimensions():
     picked = data["covariance"].sel(state="θ [rad]", other_state="r_x [m]").sel(time=2.5)
     assert float(picked) == steered.covariance[20, 2, 0]
     assert data["gains"].dims == ("interval", "control", "state")
-    np.testing.assert_array_equal(
-        data["controls"].sel(control="a_v [m/s²]"), steered.controls[:, 0]
-    )
+    accelerations = data["controls"].sel(control="a_v [m/s²]")
+    np.testing.assert_array_equal(accelerations, steered.controls[:, 0])
     assert data.attrs["status"] == "CONVERGED"
 
 
