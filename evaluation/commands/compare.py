@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -10,14 +9,16 @@ import tyro
 
 from slipcar.evaluation.commands.checks import check_figures, check_folder
 from slipcar.evaluation.commands.inputs import PaperScenarioOption, read_maker, read_scenario
-from slipcar.evaluation.commands.output import Output, OutputOption, say, say_written
+from slipcar.evaluation.commands.output import Output, OutputOption, finish, program
 from slipcar.evaluation.executors import LostWorkersError
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from slipcar.evaluation.report.document import Document
 
+_MORE = (
+    "All tables are in {folder}/table.md; --all-tables prints them here, `{program} report "
+    "{folder}` makes a page of them."
+)
 _Controllers = tyro.conf.UseAppendAction[
     Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=]SOURCE")]
 ]
@@ -199,13 +200,13 @@ def _paper(
     with output.busy("planning ..."):
         made, notes = usual.default_rows(world, **how, only=rows)
     done = compare_controllers({**made, **own}, world, reference=against, notes=notes, **options)
-    _finish(
+    folder = options["folder"]
+    finish(
         output,
-        options["folder"],
-        lambda: done.save(options["folder"], figures=figures),
+        lambda: done.save(folder, figures=figures),
         lambda: report.terminal(done, all_tables),
-        all_tables,
         report.messages(done),
+        "" if all_tables else _MORE.format(folder=folder, program=program()),
     )
     if output.json:
         print(report.json_text(done), end="")
@@ -240,13 +241,13 @@ def _suite(
     made = dataclasses.replace(whole, rows={**usual, **own}, reference=against)
     result = run_suite(made, seed, **common)
     document: Document = module.document(result)
-    _finish(
+    folder = common["folder"]
+    finish(
         output,
-        common["folder"],
-        lambda: save_suite(result, document, common["folder"], figures),
+        lambda: save_suite(result, document, folder, figures),
         lambda: document.terminal(None if all_tables else 1),
-        all_tables,
         document.notes,
+        "" if all_tables else _MORE.format(folder=folder, program=program()),
     )
     if output.json:
         print(document.to_json(), end="")
@@ -258,33 +259,6 @@ def _reference(wanted: str | None, usual: str, names: list[str]) -> str:
     if wanted is not None and wanted not in names:
         raise ValueError(f"--reference: no row is called {wanted!r}; the rows are {names}")
     return wanted or (usual if usual in names else names[0])
-
-
-def _finish(
-    output: Output,
-    folder: Path,
-    save: Callable[[], list[Path]],
-    shown: Callable[[], RenderableType],
-    all_tables: bool,
-    notes: Sequence[str],
-) -> None:
-    """Save, then print; whatever goes wrong with figures, what is saved is printed, too."""
-    out = output.console()
-    written: list[Path] = []
-    try:
-        with output.busy("writing tables and drawing figures ..."):
-            written = save()
-    finally:
-        out.print(shown())
-        if not all_tables:
-            say(
-                out,
-                f"All tables are in {folder / 'table.md'}; --all-tables prints them here, "
-                f"`slipcar report {folder}` makes a page of them.",
-            )
-        if written:
-            say_written(out, written, folder)
-        output.wrong(notes)
 
 
 def check_names(rows: list[str], own: list[str], given: int) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from slipcar.envs.observation import KINDS, Layout
+from slipcar.evaluation.commands.checks import check_folder
 from slipcar.evaluation.commands.inputs import (
     CONTROLLER_HELP,
     CONTROLLERS,
@@ -78,7 +79,7 @@ def dataset(
     world = None if scenario is None else read_scenario(scenario)
     Layout(observation, obstacle_slots)  # all that can be checked before any planning
     checked_recording(episodes, seed, exploration_noise)
-    check_request(dataset_id, folder, overwrite)
+    check_folder(check_request(dataset_id, folder, overwrite))
     driver, world = read_controller(controller, world, trust)
     with Bars({"recording": episodes}, not output.quiet) as bars:
         written = write_dataset(

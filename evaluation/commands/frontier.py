@@ -9,7 +9,7 @@ import tyro
 
 from slipcar.evaluation.commands.checks import check_figures, check_folder
 from slipcar.evaluation.commands.inputs import ScenarioOption, read_scenario
-from slipcar.evaluation.commands.output import Output, OutputOption, say_written
+from slipcar.evaluation.commands.output import Output, OutputOption, finish
 from slipcar.evaluation.frontier import EPISODES, PRICES, RECEDING_EPISODES, RECEDING_PRICES
 
 
@@ -87,13 +87,8 @@ def frontier(
         raise KeyboardInterrupt(
             f"finished points are kept in {folder}; run the command again to continue"
         ) from None
-    out = output.console()
-    with output.busy("writing tables and drawing the figure ..."):
-        written = done.save(folder, figures=figures)
-    out.print(report_frontier.terminal(done))
-    say_written(out, written, folder)
     shown = report_frontier.document(done)
-    output.wrong(shown.notes)
+    finish(output, lambda: done.save(folder, figures=figures), shown.terminal, shown.notes)
     if output.json:
         print(shown.to_json(), end="")
     return 1 if done.comparison.errors else 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json as json_text
 import os
+import shutil
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +18,7 @@ from slipcar.evaluation.report.document import plain
 from slipcar.evaluation.report.layout import Prose
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import Console, RenderableType
 
 #: Columns of a pipe or a file, where nobody says how many there are.
 _WIDTH = 120
@@ -73,6 +74,16 @@ def console() -> Console:
     return Console(highlight=False, width=max(_WIDTH, out.width))
 
 
+def program() -> str:
+    """What to type for this program: in a checkout it need not be where commands are looked for."""
+    called = Path(sys.argv[0])
+    if called.stem != "slipcar":
+        return "python -m slipcar.evaluation"
+    known = shutil.which("slipcar")
+    same = known is not None and Path(known).resolve() == called.resolve()
+    return "slipcar" if same else str(called)
+
+
 def say(out: Console, text: str) -> None:
     """Print lines that break between words; what a line begins with is set off from what follows.
 
@@ -88,8 +99,39 @@ def say(out: Console, text: str) -> None:
         out.print(Prose(line, indent=label))
 
 
-def say_written(out: Console, written: list[Path], folder: Path | None = None) -> None:
+def say_written(out: Console, written: list[Path]) -> None:
     """Which files there are now."""
-    out.print(f"{len(written)} files{f' in {folder}' if folder else ''}:", markup=False)
+    out.print(f"{len(written)} files:", markup=False)
     for path in written:
         out.print(f"  {path}", markup=False, soft_wrap=True)
+
+
+def finish(
+    output: Output,
+    save: Callable[[], list[Path]],
+    shown: Callable[[], RenderableType],
+    notes: Sequence[str] = (),
+    more: str = "",
+) -> None:
+    """Save results, then print them; also where saving fails, say for a figure.
+
+    Args:
+        output: what is printed.
+        save: writes files and returns them, tables first.
+        shown: makes what is printed.
+        notes: what readers must be told; part of what is shown, and the rest of it may be unwanted.
+        more: where to look for the rest, said once it is there.
+    """
+    out = output.console()
+    try:
+        with output.busy("writing tables and drawing figures ..."):
+            written = save()
+    except BaseException:
+        out.print(shown())
+        raise
+    finally:
+        output.wrong(notes)
+    out.print(shown())
+    if more:
+        say(out, more)
+    say_written(out, written)

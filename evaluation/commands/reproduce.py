@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from slipcar.evaluation.commands.checks import check_figures, check_file, check_folder
-from slipcar.evaluation.commands.output import Output, OutputOption, say_written
+from slipcar.evaluation.commands.output import Output, OutputOption, finish
 from slipcar.evaluation.reproduction.reproduce import EPISODES
 
 
@@ -73,16 +73,17 @@ def reproduce(
             n_jobs=workers,
             progress=lambda what, share: bar.update(task, completed=share, description=what),
         )
-    out = output.console()
-    with output.busy("writing tables and drawing figures ..."):
+    shown = done.document(figures=False)
+
+    def save() -> list[Path]:
         written = done.save(folder, figures=figures)
         if docs is not None:
             from slipcar.evaluation.reproduction import page as reproduce_page
 
             written += reproduce_page.save(done, docs, folder)
-    shown = done.document(figures=False)
-    out.print(shown.terminal())
-    say_written(out, written)
+        return written
+
+    finish(output, save, shown.terminal)
     if output.json:
         print(shown.to_json(), end="")
     return 0

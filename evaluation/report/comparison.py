@@ -155,7 +155,7 @@ def sentences(comparison: ComparisonRecord) -> list[str]:
         low, high = frame["total_difference_low"][rows], frame["total_difference_high"][rows]
         cheaper, dearer = int((high < 0.0).sum()), int((low > 0.0).sum())
         found.append(
-            f"Against “{reference}” on the same paths, of {len(rows)} rows {cheaper} are cheaper, "
+            f"Against “{reference}” on the same paths: of {len(rows)} other rows {cheaper} cheaper, "
             f"{dearer} dearer, {len(rows) - cheaper - dearer} not told apart (95 % intervals)."
         )
     return found

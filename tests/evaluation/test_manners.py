@@ -96,7 +96,7 @@ def test_compare_prints_the_main_table_three_sentences_and_where_the_rest_is(tmp
     assert said.count("controller") == 1
     assert "Cheapest: “" in said
     assert "Fewest collisions: “" in said
-    assert "Against “stochastic SCP” on the same paths, of 2 rows" in said
+    assert "Against “stochastic SCP” on the same paths: of 2 other rows" in said
     assert "a note" in said
     assert f"{tmp_path}/table.md; --all-tables prints them here" in said
     assert main([*options, "--all-tables"]) == 0
@@ -245,3 +245,18 @@ def test_hints_are_commands_for_a_checkout_too():
         assert install(extra).startswith("pip install '")
         assert "slipcar" not in install(extra)
     assert "pygame-ce" in install("plot")
+
+
+def test_hints_name_the_program_as_it_can_be_called(monkeypatch, tmp_path):
+    from slipcar.evaluation.commands.output import program
+
+    script = tmp_path / "slipcar"
+    script.write_text("#!/bin/sh\n")
+    script.chmod(0o755)
+    monkeypatch.setattr("sys.argv", [".venv/bin/slipcar", "compare"])
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert program() == ".venv/bin/slipcar"
+    monkeypatch.setattr("sys.argv", [str(script)])
+    assert program() == "slipcar"
+    monkeypatch.setattr("sys.argv", ["/x/evaluation/__main__.py"])
+    assert program() == "python -m slipcar.evaluation"
