@@ -128,8 +128,8 @@ def _winners(comparison: ComparisonRecord) -> dict[str, list[bool]]:
 def sentences(comparison: ComparisonRecord) -> list[str]:
     """What the main table says, in three sentences: no more than its intervals allow.
 
-    The cheapest row, the safest one, and how many differ from the reference; "same" are rows whose
-    paired difference has an interval that includes zero.
+    The cheapest row, the safest one, and how many differ from the reference; not told apart are
+    rows whose paired difference has an interval that includes zero.
     """
     found = []
     for metric, what, text in (
@@ -155,8 +155,8 @@ def sentences(comparison: ComparisonRecord) -> list[str]:
         low, high = frame["total_difference_low"][rows], frame["total_difference_high"][rows]
         cheaper, dearer = int((high < 0.0).sum()), int((low > 0.0).sum())
         found.append(
-            f"Against “{reference}” on the same paths: of {len(rows)} other rows {cheaper} cheaper, "
-            f"{dearer} dearer, {len(rows) - cheaper - dearer} not told apart (95 % intervals)."
+            f"Against “{reference}” on the same paths: of {len(rows)} other rows {cheaper} "
+            f"cheaper, {dearer} dearer, {len(rows) - cheaper - dearer} not told apart (95 % intervals)."
         )
     return found
 
