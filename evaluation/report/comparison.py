@@ -156,7 +156,8 @@ def sentences(comparison: ComparisonRecord) -> list[str]:
         cheaper, dearer = int((high < 0.0).sum()), int((low > 0.0).sum())
         found.append(
             f"Against “{reference}” on the same paths: of {len(rows)} other rows {cheaper} "
-            f"cheaper, {dearer} dearer, {len(rows) - cheaper - dearer} not told apart (95 % intervals)."
+            f"cheaper, {dearer} dearer, {len(rows) - cheaper - dearer} not told apart "
+            "(95 % intervals)."
         )
     return found
 
