@@ -18,7 +18,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Errors alone: the warnings are about setuptools' opinion of its own features.
 PIP := $(BIN)/python -m pip -qq install
-PACKAGES := envs planner baselines evaluation
+PACKAGES := package envs planner baselines evaluation
 # torch comes first and exactly: whatever asked for it otherwise would take the newest build,
 # with gigabytes of CUDA packages.
 TORCH := torch==2.13.0
@@ -90,12 +90,14 @@ bench-worlds: $(BENCH_INSTALLED)  ## plan for 1000 random worlds, ours and IPOPT
 bench-docs: $(BENCH_INSTALLED)  ## every benchmark once more, into docs/benchmarks*.md
 	$(BIN)/python benchmarks/run.py --docs $(ARGS)
 
-lint: types  ## ruff (rules and format) and mypy
+lint: types  ## ruff (rules and format), mypy and pyright
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 
-types: $(INSTALLED)  ## mypy over the installed package
+types: $(INSTALLED)  ## mypy over the installed package; mypy and pyright over a user's script
 	$(BIN)/mypy
+	$(BIN)/mypy tests/typing/user_script.py
+	$(BIN)/basedpyright
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
 compare suites frontier reproduce kills matrix fuzz train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1

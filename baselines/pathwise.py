@@ -20,6 +20,7 @@ from pathlib import Path
 from slipcar.baselines.pathwise_config import PathwiseConfig
 from slipcar.baselines.policy import ACTION_DIM, Policy
 from slipcar.baselines.progress import Progress
+from slipcar.envs.extras import install
 from slipcar.envs.options import layout_for
 from slipcar.envs.sources import Source, base_of, source_of
 from slipcar.envs.validate import checked_int
@@ -69,9 +70,7 @@ def train_pathwise(
     try:
         from slipcar.baselines.pathwise_training import train
     except ImportError as error:
-        raise ImportError(
-            f"training needs torch and tqdm ({error}): pip install 'slipcar[rl]'"
-        ) from error
+        raise ImportError(f"training needs torch and tqdm ({error}): {install('rl')}") from error
     sizes = (layout.size, *config.hidden, ACTION_DIM)
     if initial is not None and (initial.layout, initial.sizes) != (layout, sizes):
         raise ValueError(

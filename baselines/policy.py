@@ -60,6 +60,11 @@ class Policy:
     #: That it looks at the state.
     closed_loop: ClassVar[bool] = True
 
+    def __repr__(self) -> str:
+        sizes = " → ".join(map(str, self.sizes))
+        world = "a family" if isinstance(self.trained_on, Family) else "a scenario"
+        return f"Policy({self.observation}, {sizes}, trained on {world})"
+
     def __post_init__(self) -> None:
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(

@@ -15,6 +15,7 @@ from slipcar.baselines.checkpoint import describe_run, read_checkpoint
 from slipcar.baselines.config import PPOConfig
 from slipcar.baselines.policy import Policy
 from slipcar.baselines.progress import Progress
+from slipcar.envs.extras import install
 from slipcar.envs.options import layout_for
 from slipcar.envs.sources import Source, base_of, source_of
 from slipcar.envs.validate import checked_int
@@ -72,7 +73,7 @@ def train_ppo(
     except ImportError as error:
         raise ImportError(
             f"training needs torch, Stable-Baselines3, tensorboard and tqdm ({error}): "
-            "pip install 'slipcar[rl]'"
+            f"{install('rl')}"
         ) from error
     return train(
         source, config, seed, run, initial=initial,

@@ -18,6 +18,7 @@ from slipcar.baselines.policy import Policy
 from slipcar.baselines.ppo import train_ppo
 from slipcar.baselines.progress import Progress
 from slipcar.baselines.storage import load_policy, save_policy
+from slipcar.envs.extras import install
 from slipcar.envs.options import layout_for
 from slipcar.envs.sources import Source, base_of, source_of
 from slipcar.envs.validate import checked_int
@@ -60,7 +61,7 @@ def clone_planner(
     try:
         from slipcar.baselines.cloning import train
     except ImportError as error:
-        raise ImportError(f"training needs torch ({error}): pip install 'slipcar[rl]'") from error
+        raise ImportError(f"training needs torch ({error}): {install('rl')}") from error
     policy = train(source, layout, config, seed)
     if folder is not None:
         save_policy(policy, Path(folder) / "policy")

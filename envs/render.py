@@ -1,6 +1,6 @@
 """`rgb_array` and `human`: the scene with a line of numbers under it.
 
-Needs pygame (`pip install "slipcar[plot]"`), imported when the first screen is made. Frames
+Needs pygame (the extra `plot`), imported when the first screen is made. Frames
 for `rgb_array` are drawn off screen and need no display.
 """
 

@@ -11,14 +11,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from array_api_compat import device
 from numpy.typing import ArrayLike
 
-from slipcar.envs import car, cost, routes, worlds
+from slipcar.envs import car, cost, drawing, routes, worlds
 from slipcar.envs import observation as layouts
 from slipcar.envs.arrays import array_namespace
 from slipcar.envs.parameters import Parameters
@@ -30,6 +30,11 @@ from slipcar.envs.validate import (
     parsed_object,
     replaced,
 )
+
+if TYPE_CHECKING:  # pyright lets no cached property be what a protocol reads
+    cached_property = property
+else:
+    cached_property = functools.cached_property
 
 _FORMAT = 1
 
@@ -260,12 +265,12 @@ class Scenario:
         """Length of a control interval [s]."""
         return self.horizon / (self.nodes - 1)
 
-    @functools.cached_property
+    @cached_property
     def times(self) -> np.ndarray:
         """Node times, (N,) [s]."""
         return _frozen(np.linspace(0.0, self.horizon, self.nodes))
 
-    @functools.cached_property
+    @cached_property
     def control_weight(self) -> np.ndarray:
         """R of G(u) = uᵀ R u, (2, 2): the identity."""
         return _frozen(np.eye(car.CONTROL_DIM))
@@ -275,6 +280,25 @@ class Scenario:
         """Components of the state that are angles of period 2π."""
         return (2,)
 
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """What figures and frames call the states, with their units."""
+        return _labels(car.STATE_NAMES, car.STATE_UNITS)
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """What figures and frames call the controls, with their units."""
+        return _labels(car.CONTROL_NAMES, car.CONTROL_UNITS)
+
+    @property
+    def plane(self) -> tuple[int, int]:
+        """The two states that :meth:`draw` draws in: the position."""
+        return 0, 1
+
+    def draw(self, axes: Any) -> None:
+        """Draw the world into the axes of matplotlib: obstacles, clearance, start and goal."""
+        drawing.draw_world(axes, self.obstacles, self.clearance, self.start, self.goal)
+
     def drift(self, t: Any, x: Any, u: Any) -> Any:
         """b(x, u), (..., 5); see :func:`slipcar.envs.car.drift`."""
         return car.drift(x, u)
@@ -283,7 +307,7 @@ class Scenario:
         """∂b/∂x (..., 5, 5) and ∂b/∂u (..., 5, 2)."""
         return car.drift_jacobian(x, u)
 
-    @functools.cached_property
+    @cached_property
     def process(self) -> tuple[tuple[int, float], ...]:
         """Which states process noise reaches, and its standard deviation per √s, p pairs."""
         deviations = self.process_noise.tolist()
@@ -294,12 +318,12 @@ class Scenario:
         """Brownian motions that drive the car, 3 + p: three of the slip, then the process noise."""
         return car.NOISE_DIM + len(self.process)
 
-    @functools.cached_property
+    @cached_property
     def row_parameters(self) -> Parameters:
         """The numbers of a step, for components that are rows of float64."""
         return Parameters.of(self).shaped(np.empty(0), self)
 
-    @functools.cached_property
+    @cached_property
     def start_covariance(self) -> np.ndarray:
         """Covariance of x(0), (5, 5)."""
         return _frozen(np.diag(self.start_deviation**2))
@@ -312,7 +336,7 @@ class Scenario:
         """∂σ/∂x, (..., 5, 3 + p, 5)."""
         return car.diffusion_jacobian(x, self.slip.tolist(), self.process)
 
-    @functools.cached_property
+    @cached_property
     def penalty_weight(self) -> np.ndarray:
         """λ for every obstacle, (k,)."""
         return _frozen(np.full(len(self.obstacles), self.obstacle_weight))
@@ -387,7 +411,7 @@ class Scenario:
         """
         return self._straight_line.copy(), np.zeros((self.nodes - 1, car.CONTROL_DIM))
 
-    @functools.cached_property
+    @cached_property
     def _straight_line(self) -> np.ndarray:
         fraction = (self.times / self.horizon)[:, None]
         x = self.start + fraction * (self.goal - self.start)
@@ -473,6 +497,10 @@ def _like(x: Any, values: np.ndarray) -> Any:
         return values
     # A copy, because Torch warns when it is handed read-only memory.
     return array_namespace(x).asarray(values.copy(), dtype=x.dtype, device=device(x))
+
+
+def _labels(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{name} [{unit}]" for name, unit in zip(names, units, strict=True))
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slipcar.envs.extras import install
+
 if TYPE_CHECKING:
     import torch
 
@@ -25,7 +27,7 @@ def torch_module() -> Any:
     try:
         import torch
     except ImportError as error:
-        raise ImportError(f'this needs PyTorch: pip install "slipcar[rl]" ({error})') from error
+        raise ImportError(f"this needs PyTorch ({error}): {install('rl')}") from error
     return torch
 
 

@@ -7,6 +7,8 @@ or a row that failed in exit code 1; an interruption in 130.
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import os
 import sys
 from collections.abc import Callable, Sequence
 
@@ -32,7 +34,10 @@ _DESCRIPTION = """Stochastic SCP, a slipping car, and an honest comparison with 
     slipcar report results               one page of it all
     slipcar frontier                     the price of safety: three curves, PPO, the paper
     slipcar plan --figures figures       one plan, what it proves, figures
-    slipcar COMMAND --help               every option of a command"""
+    slipcar COMMAND --help               every option of a command
+    slipcar --version                    which slipcar this is
+
+Every command knows --quiet (only what went wrong) and --json (numbers alone)."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,6 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     speak_plainly()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
+        if arguments[:1] == ["--version"]:
+            print(f"slipcar {importlib.metadata.version('slipcar')}")
+            return 0
         if arguments and arguments[0] in COMMANDS:
             command = _command(arguments[0])
             prog = f"slipcar {arguments[0]}"
@@ -66,6 +74,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         print(f"slipcar: interrupted{f': {stop}' if str(stop) else ''}", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read the output has enough of it; files are written before
+        # Python would complain once more when it flushes at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (ValueError, OSError, ImportError) as error:
         print(f"slipcar {arguments[0]}: error: {_one_line(error)}", file=sys.stderr)
         return 2

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from slipcar.envs.extras import install
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import checked_float
 from slipcar.evaluation.cells import Store
@@ -225,12 +226,45 @@ def _too_wide(results: dict[str, Result], resolution: float) -> list[str]:
     return found
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Comparison(ComparisonRecord):
     """What :func:`compare` returns: its record, and ways to write it.
 
     Attributes are those of :class:`slipcar.evaluation.comparison_record.ComparisonRecord`.
     """
+
+    def _repr_html_(self) -> str:
+        return report.html(self)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw mean cost against collision rate, with 95 % intervals of both, with matplotlib.
+
+        Args:
+            axes: an Axes to draw into; None makes a figure.
+
+        Returns:
+            The Axes.
+
+        Raises:
+            ImportError: without matplotlib.
+            ValueError: if no row finished.
+        """
+        if not self.results:
+            raise ValueError("there is nothing to plot: no row finished")
+        try:
+            import matplotlib.pyplot as plt
+
+            from slipcar.evaluation.figures.rows import draw_tradeoff
+        except ImportError as error:
+            raise ImportError(f"plot needs matplotlib ({error}): {install('plot')}") from error
+        if axes is None:
+            _, axes = plt.subplots(figsize=(8.8, 4.3), layout="constrained")
+        draw_tradeoff(axes, self)
+        axes.legend(
+            title="filled: closed loop, hollow: open loop", alignment="left", fontsize="small",
+            loc="upper left", bbox_to_anchor=(1.0, 1.0),
+        )  # fmt: skip
+        return axes
 
     def to_markdown(self) -> str:
         """Tables in Markdown with what they mean and where they come from."""
@@ -249,7 +283,7 @@ class Comparison(ComparisonRecord):
 
         Args:
             folder: made if it does not exist.
-            figures: also draw them (PNG and PDF; needs matplotlib, `pip install slipcar[plot]`).
+            figures: also draw them (PNG and PDF; needs matplotlib).
 
         Returns:
             The files written.

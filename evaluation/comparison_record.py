@@ -10,11 +10,15 @@ import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from slipcar.envs.scenario import Scenario
-from slipcar.evaluation.metrics import Result
+from slipcar.evaluation.metrics import FIELDS, Result, leading
+from slipcar.evaluation.statistics import Leader
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
 #: Per-episode metrics whose paired differences against the reference row are shown.
 DIFFERENCES = {
@@ -56,6 +60,41 @@ class ComparisonRecord:
     wall_time: float
     provenance: dict[str, Any]
 
+    def __repr__(self) -> str:
+        failed = f", {len(self.errors)} failed" if self.errors else ""
+        return (
+            f"{type(self).__name__}({len(self.controllers)} rows{failed}, {self.episodes:,} "
+            f"episodes, seed {self.seed}, reference {self.reference!r})"
+        )
+
+    def to_frame(self) -> pd.DataFrame:
+        """The same as `frame`."""
+        return self.frame
+
+    def to_xarray(self) -> xr.Dataset:
+        """Every per-episode metric over controller and episode, SI units. Needs xarray.
+
+        Of several trainings it is the mean of each path; rows of fewer episodes end in nan.
+
+        Raises:
+            ImportError: without xarray.
+        """
+        try:
+            import xarray as xr
+        except ImportError as error:
+            raise ImportError(f"to_xarray needs xarray ({error}): pip install xarray") from error
+        names = list(self.results)
+        metrics = ("total", *FIELDS)
+        data = np.full((len(metrics), len(names), self.episodes), np.nan)
+        for j, result in enumerate(self.results.values()):
+            for i, metric in enumerate(metrics):
+                data[i, j, : result.episodes] = result.per_path(metric)
+        return xr.Dataset(
+            {metric: (("controller", "episode"), data[i]) for i, metric in enumerate(metrics)},
+            coords={"controller": names, "episode": np.arange(self.episodes)},
+            attrs={"seed": self.seed, "substeps": self.substeps, "reference": self.reference},
+        )
+
     @functools.cached_property
     def frame(self) -> pd.DataFrame:
         """One row a controller, raw numbers in SI units; differences are to `reference`."""
@@ -71,6 +110,11 @@ class ComparisonRecord:
         columns = list(dict.fromkeys(key for row in rows.values() for key in row if key != "error"))
         frame = pd.DataFrame.from_dict(rows, orient="index", columns=[*columns, "error"])
         return frame.rename_axis("controller")
+
+    @functools.cached_property
+    def leaders(self) -> dict[str, Leader | None]:
+        """Who has the least mean cost, and the fewest collisions at and between nodes; who ties."""
+        return {name: leading(self.results, name) for name in DIFFERENCES.values()}
 
     def _differences(self, name: str) -> dict[str, float]:
         found: dict[str, float] = {}

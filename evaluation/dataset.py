@@ -6,7 +6,7 @@
 
 What is stored is what `gym.make("slipcar.envs:SlipCar-v0", ...)` would have returned: episode i of
 a seed is driven along the Brownian path that :func:`slipcar.evaluation.evaluate` drives it along,
-so its return is minus the cost found there. Needs Minari (`pip install "slipcar[data]"`); format
+so its return is minus the cost found there. Needs Minari (the extra `data`); format
 and names are Minari 0.5's (https://minari.farama.org/content/dataset_standards).
 """
 
@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.envs import observation as layouts
+from slipcar.envs.extras import install
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import checked_int
 from slipcar.evaluation.cells import controller_fingerprint
@@ -183,7 +184,7 @@ def check_request(
             f"between slashes, and a version -v0 at the end; not {dataset_id!r}"
         )
     _minari()
-    root = Path(folder) if folder is not None else _default_folder()
+    root = Path(folder).absolute() if folder is not None else _default_folder()
     path = root / dataset_id
     if _is_dataset(path) and not overwrite:
         raise ValueError(
@@ -280,7 +281,7 @@ def _minari() -> tuple[Any, Any]:
         from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
         raise ImportError(
-            f'writing a dataset needs Minari and h5py: pip install "slipcar[data]" ({error})'
+            f"writing a dataset needs Minari and h5py ({error}): {install('data')}"
         ) from error
     return MinariStorage, EpisodeBuffer
 

@@ -27,6 +27,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
+from slipcar.envs.extras import install
 from slipcar.envs.validate import checked_int
 from slipcar.evaluation.provenance import code_digest, versions
 from slipcar.evaluation.threads import ENVIRONMENT, one_thread
@@ -64,6 +65,7 @@ class Executor:
             the pool broke. None works in this process.
         alive: raises LostWorkersError if nobody is left to work; called while waiting.
         software: digest of the software that workers must have; None where they are this one's.
+        local: whether workers see the files of this machine.
     """
 
     name: str = "this process"
@@ -71,10 +73,14 @@ class Executor:
     open: Callable[[], Any] | None = None
     alive: Callable[[], None] = lambda: None
     software: str | None = None
+    local: bool = False
 
 
 def run(
-    work: Callable[[Any], Any], tasks: Iterable[Any], executor: Executor | None = None
+    work: Callable[[Any], Any],
+    tasks: Iterable[Any],
+    executor: Executor | None = None,
+    waiting: Callable[[], None] = lambda: None,
 ) -> Iterator[Outcome]:
     """Do tasks and yield them as they finish, in any order.
 
@@ -85,6 +91,7 @@ def run(
         work: a function of a task, to be found by import where workers are.
         tasks: picklable.
         executor: see :func:`open_executor`; None works in this process.
+        waiting: called now and then while others work.
 
     Raises:
         LostWorkersError: if the cluster is gone; what was yielded before is done.
@@ -98,14 +105,17 @@ def run(
                 outcome = Outcome(task, None, _portable(error))
             yield outcome
         return
-    yield from _run_in_pool(work, tasks, executor)
+    yield from _run_in_pool(work, tasks, executor, waiting)
 
 
 def _run_in_pool(
-    work: Callable[[Any], Any], tasks: Iterable[Any], executor: Executor
+    work: Callable[[Any], Any],
+    tasks: Iterable[Any],
+    executor: Executor,
+    waiting: Callable[[], None],
 ) -> Iterator[Outcome]:
     assert executor.open is not None
-    pool, waiting = executor.open(), iter(tasks)
+    pool, coming = executor.open(), iter(tasks)
     under_way: dict[concurrent.futures.Future, Any] = {}
     suspects: deque[Any] = deque()  # were in some worker's hands when a worker died
     alone: Any = None  # the suspect that runs by itself, to see whether it was the cause
@@ -114,7 +124,7 @@ def _run_in_pool(
         while not exhausted or suspects or under_way:
             # Two each, so that nobody waits for the next; suspects one at a time.
             free = 0 if suspects else 2 * executor.workers - len(under_way)
-            ready = list(itertools.islice(waiting, free)) if free > 0 and not exhausted else []
+            ready = list(itertools.islice(coming, free)) if free > 0 and not exhausted else []
             exhausted = exhausted or (free > 0 and len(ready) < free)
             if suspects and not under_way:
                 alone = suspects.popleft()
@@ -130,8 +140,9 @@ def _run_in_pool(
             if not under_way:
                 continue
             done, _ = concurrent.futures.wait(
-                under_way, timeout=2.0, return_when=concurrent.futures.FIRST_COMPLETED
+                under_way, timeout=1.0, return_when=concurrent.futures.FIRST_COMPLETED
             )
+            waiting()
             if not done:
                 executor.alive()
             broken = False
@@ -237,7 +248,7 @@ def open_executor(workers: int = 1, cluster: str | None = None) -> Iterator[Exec
         import distributed
     except ImportError as error:
         raise ImportError(
-            f"cluster={cluster!r} needs Dask ({error}): pip install 'slipcar[cluster]'"
+            f"cluster={cluster!r} needs Dask ({error}): {install('cluster')}"
         ) from error
     with contextlib.ExitStack() as stack:
         if address:
@@ -263,7 +274,7 @@ def _loky(workers: int) -> Iterator[Executor]:
         return get_reusable_executor(max_workers=workers, env=ENVIRONMENT, timeout=60)
 
     try:
-        yield Executor(f"{workers} processes", workers, pool)
+        yield Executor(f"{workers} processes", workers, pool, local=True)
     except BaseException:  # an interruption must not wait for the tasks under way
         pool().shutdown(wait=False, kill_workers=True)
         raise

@@ -2,8 +2,8 @@
 
 Between the nodes the car moves straight from state to state: Euler–Maruyama says no more.
 
-Needs pygame, pillow for GIFs and frames (`pip install "slipcar[plot]"`), and imageio-ffmpeg for
-MP4s (`pip install "slipcar[video]"`); each is imported when a picture is made.
+Needs pygame, pillow for GIFs and frames (the extra `plot`), and imageio-ffmpeg for
+MP4s (`video`); each is imported when a picture is made.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.envs.extras import install
 from slipcar.evaluation.recording import Recording
 
 #: Pictures per second of a film that moves smoothly; three for each node of the paper's case.
@@ -187,7 +188,7 @@ def import_ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise ImportError('films need imageio-ffmpeg: pip install "slipcar[video]"') from error
+        raise ImportError(f"films need imageio-ffmpeg: {install('video')}") from error
     return imageio_ffmpeg
 
 

@@ -213,7 +213,7 @@ def checked_prices(name: str, prices: Sequence[float]) -> list[float]:
     return sorted(found)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Frontier(FrontierRecord):
     """What :func:`frontier` returns: its record, and ways to write it.
 
@@ -231,7 +231,7 @@ class Frontier(FrontierRecord):
 
         Args:
             folder: made if it does not exist.
-            figures: also draw `frontier.png` and `.pdf` (`pip install slipcar[plot]`).
+            figures: also draw `frontier.png` and `.pdf` (needs matplotlib).
 
         Returns:
             The files written.

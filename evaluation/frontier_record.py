@@ -14,6 +14,7 @@ import numpy as np
 from slipcar.evaluation.comparison_record import ComparisonRecord
 from slipcar.evaluation.controller import Controller
 from slipcar.evaluation.runs import Runs
+from slipcar.planner.display import brief
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,6 +57,8 @@ class FrontierRecord:
     comparison: ComparisonRecord
     receding_episodes: int
     notes: tuple[str, ...]
+
+    __repr__ = brief
 
     @functools.cached_property
     def frame(self) -> pd.DataFrame:

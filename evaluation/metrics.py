@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.statistics import (
     Interval,
+    Leader,
     cvar,
+    leader,
     paired_difference,
     quantile,
     rate_interval,
@@ -19,12 +22,18 @@ from slipcar.evaluation.statistics import (
     student_interval,
     welch,
 )
+from slipcar.planner.display import brief, facts
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Quantiles that tables show: of the clearance, and of a path's cost.
 CLEARANCE_QUANTILES = (0.01, 0.05, 0.5)
 COST_QUANTILES = (0.5, 0.95, 0.99)
 #: Metrics that are 0 or 1, or between.
 RATES = ("collision", "touched")
+#: So many standard errors apart no bootstrap is needed to tell which mean is less.
+_FAR = 10.0
 #: Share of the worst episodes that a conditional value at risk averages.
 TAIL = 0.05
 
@@ -55,6 +64,8 @@ class EpisodeMetrics:
     position_error: np.ndarray
     heading_error: np.ndarray
     speed_error: np.ndarray
+
+    __repr__ = brief
 
     @functools.cached_property
     def total(self) -> np.ndarray:
@@ -143,6 +154,40 @@ class Result:
     preparation_time: float
     wall_time: float
     runs: tuple[Result, ...] = ()
+
+    def __repr__(self) -> str:
+        known = self._facts()
+        said = [f"{known.pop('loop')} loop", f"{known.pop('episodes')} episodes"]
+        return f"Result({', '.join([*said, *(f'{name} {text}' for name, text in known.items())])})"
+
+    def _repr_html_(self) -> str:
+        return facts("Result", self._facts())
+
+    def _facts(self) -> dict[str, str]:
+        """What there is to say in a few words: name -> text."""
+        (low, high), (below, above) = self.collision_interval, self.between_interval
+        trainings = {"trainings": str(len(self.runs))} if self.runs else {}
+        return {
+            "loop": "closed" if self.closed_loop else "open",
+            "episodes": f"{self.episodes:,}",
+            **trainings,
+            "total cost": f"{self.total:.3f} ± {self.total_se:.3f}",
+            "collisions": f"{self.collision_rate:.2%} [{low:.2%}, {high:.2%}]",
+            "at or between nodes": f"{self.between_rate:.2%} [{below:.2%}, {above:.2%}]",
+            "position RMS": f"{self.position_rms:.4f} m",
+        }
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row an episode, every metric in SI units; with several trainings, a level for each."""
+        import pandas as pd
+
+        columns = self.metrics.to_dict() | {"total": self.metrics.total}
+        paths = range(self.episodes)
+        if not self.runs:
+            return pd.DataFrame(columns, index=pd.Index(paths, name="episode"))
+        levels = [range(len(self.runs)), paths]
+        index = pd.MultiIndex.from_product(levels, names=["training", "episode"])
+        return pd.DataFrame(columns, index=index)
 
     @classmethod
     def of_runs(cls, runs: Sequence[Result]) -> Result:
@@ -366,6 +411,22 @@ class Result:
             _, lower, higher = student_interval(float(values.mean()), error, freedom)
             low, high = max(0.0, min(low, lower)), min(1.0, max(high, higher))
         return low, high
+
+
+def leading(results: Mapping[str, Result], metric: str) -> Leader | None:
+    """Which row has the least mean of a metric, and which ties; by paired differences."""
+    means = {name: float(result.per_path(metric).mean()) for name, result in results.items()}
+
+    def difference(name: str, best: str) -> Interval:
+        row, reference = results[name], results[best]
+        n = min(row.episodes, reference.episodes)
+        paired = row.per_path(metric)[:n] - reference.per_path(metric)[:n]
+        error = standard_error(paired)
+        if not (row.runs or reference.runs) and paired.mean() > _FAR * error > 0.0:
+            return student_interval(float(paired.mean()), error, float("inf"))
+        return row.difference(reference, metric)
+
+    return leader(means, difference)
 
 
 def _together(paths: float, trainings: float) -> float:

@@ -301,8 +301,12 @@ class Measured:
     wall_time: float
 
 
-def measure(stretch: Stretch) -> Measured:
+def measure(stretch: Stretch, tick: Callable[[float], None] | None = None) -> Measured:
     """Drive the episodes of a stretch and measure each.
+
+    Args:
+        stretch: which.
+        tick: called at each step with the episodes done so far, parts of them counted.
 
     Raises:
         ValueError: as :func:`evaluate`.
@@ -323,6 +327,9 @@ def measure(stretch: Stretch) -> Measured:
         with time_limit(stretch.time_limit, f"{wanted} episodes") as look:
             for step in played:
                 look()
+                if tick is not None:
+                    driven = (step.index + 1) / (scenario.nodes - 1)
+                    tick(first - stretch.first + driven * wanted)
                 moved = step.moved
                 effort = effort + moved.effort
                 obstacle = obstacle + moved.obstacle

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
+import functools
+from collections.abc import Callable, Sequence
+
 from slipcar import baselines
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.controller import Controller
@@ -33,6 +37,7 @@ def default_rows(
     *,
     variance_weight: float = 1.0,
     policy: Controller | None = None,
+    only: Sequence[str] = (),
 ) -> tuple[dict[str, Controller | Runs], list[str]]:
     """Controllers by name, in the order of the table, and what a reader must be told of them.
 
@@ -48,9 +53,45 @@ def default_rows(
         variance_weight: of stochastic SCP; the rows beyond the paper charge what the noise is
             expected to cost, and need none.
         policy: the only learned row; None takes all that are shipped.
+        only: names or patterns of the rows wanted (:func:`chosen`); nothing else is planned.
 
     Raises:
-        ValueError: for a scenario that cannot be driven or planned.
+        ValueError: for a scenario that cannot be driven or planned, or an unknown row.
+    """
+    makers, notes = row_makers(scenario, variance_weight=variance_weight, policy=policy)
+    names = chosen(list(makers), only)
+    return {name: makers[name]() for name in names}, notes
+
+
+def chosen(names: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """The names that some words mean, in their own order: whole names, or patterns with * and ?.
+
+    No words mean all of them. Case does not matter.
+
+    Raises:
+        ValueError: for a word that means none, listing the names.
+    """
+
+    def means(word: str, name: str) -> bool:
+        word, name = word.lower(), name.lower()
+        return word == name or fnmatch.fnmatchcase(name, word)
+
+    for word in wanted:
+        if not any(means(word, name) for name in names):
+            raise ValueError(f"no row is called {word!r}; the rows are {list(names)}")
+    return [name for name in names if not wanted or any(means(word, name) for word in wanted)]
+
+
+def row_makers(
+    scenario: Scenario | str,
+    *,
+    variance_weight: float = 1.0,
+    policy: Controller | None = None,
+) -> tuple[dict[str, Callable[[], Controller | Runs]], list[str]]:
+    """What makes each of :func:`default_rows`; making one plans no more than it needs.
+
+    Returns:
+        Makers by name, and notes, to which those on plans are added as these are made.
     """
     scenario = Scenario.of(scenario)
     scenario.action_scale  # noqa: B018  raises now if it is unbounded
@@ -61,21 +102,40 @@ def default_rows(
             f"{STOCHASTIC}: variance weight 0, because chance reaches v or ω here, and the paper's "
             "penalty needs them certain."
         )
-    # So that the times in the table are warm ones, without first-call costs.
-    plan(scenario, variance_weight=weight)
-    deterministic = baselines.deterministic_scp(scenario)
-    stochastic = plan(scenario, variance_weight=weight)
-    rows: dict[str, Controller | Runs] = {
-        STRAIGHT: baselines.straight(scenario),
-        DETERMINISTIC: OpenLoop(deterministic),
-        STOCHASTIC: OpenLoop(stochastic),
-        FEEDBACK: Feedback(stochastic),
+    planned = {
+        DETERMINISTIC: lambda: baselines.deterministic_scp(scenario),
+        STOCHASTIC: lambda: plan(scenario, variance_weight=weight),
+        CHANCE: lambda: plan(scenario, risk=OPEN_RISK),
+        STEERED: lambda: plan(scenario, feedback=True),
+        STEERED_CHANCE: lambda: plan(scenario, feedback=True, risk=FEEDBACK_RISK),
     }
-    for name, found in ((DETERMINISTIC, deterministic), (STOCHASTIC, stochastic)):
-        notes += plan_notes(name, found)
-    rows |= learned(scenario, policy, notes)
-    rows |= _beyond_the_paper(scenario, notes)
-    return rows, notes
+
+    @functools.cache
+    def found(name: str) -> Plan:
+        if name in (DETERMINISTIC, STOCHASTIC, STEERED):
+            planned[name]()  # so that the times in the table are warm ones
+        made = planned[name]()
+        notes.extend(plan_notes(name, made))
+        return made
+
+    def with_margins() -> Controller:
+        risk = found(STEERED_CHANCE).risk
+        price = risk.price if risk is not None and risk.reached else MARGIN_PRICE
+        return RecedingHorizon(scenario, risk_price=price)
+
+    learners = learned(scenario, policy, notes)
+    return {
+        STRAIGHT: lambda: baselines.straight(scenario),
+        DETERMINISTIC: lambda: OpenLoop(found(DETERMINISTIC)),
+        STOCHASTIC: lambda: OpenLoop(found(STOCHASTIC)),
+        FEEDBACK: lambda: Feedback(found(STOCHASTIC)),
+        **{name: functools.partial(learners.__getitem__, name) for name in learners},
+        CHANCE: lambda: OpenLoop(found(CHANCE)),
+        STEERED: lambda: Feedback(found(STEERED)),
+        STEERED_CHANCE: lambda: Feedback(found(STEERED_CHANCE)),
+        RECEDING: lambda: RecedingHorizon(scenario),
+        RECEDING_MARGINS: with_margins,
+    }, notes
 
 
 def learned(
@@ -111,22 +171,3 @@ def plan_notes(name: str, found: Plan) -> list[str]:
         return []
     more = f" {found.message}" if found.message else ""
     return [f"{name}: the plan is {found.status}, {found.status.value}.{more}"]
-
-
-def _beyond_the_paper(scenario: Scenario, notes: list[str]) -> dict[str, Controller]:
-    """Rows of chance constraints, planned feedback and receding horizons."""
-    plan(scenario, feedback=True)  # warm as well
-    chance = plan(scenario, risk=OPEN_RISK)
-    steered = plan(scenario, feedback=True)
-    steered_chance = plan(scenario, feedback=True, risk=FEEDBACK_RISK)
-    for name, found in ((CHANCE, chance), (STEERED, steered), (STEERED_CHANCE, steered_chance)):
-        notes += plan_notes(name, found)
-    risk = steered_chance.risk
-    price = risk.price if risk is not None and risk.reached else MARGIN_PRICE
-    return {
-        CHANCE: OpenLoop(chance),
-        STEERED: Feedback(steered),
-        STEERED_CHANCE: Feedback(steered_chance),
-        RECEDING: RecedingHorizon(scenario),
-        RECEDING_MARGINS: RecedingHorizon(scenario, risk_price=price),
-    }

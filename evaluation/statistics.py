@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,11 @@ from slipcar.planner.search.risk import CONFIDENCE, wilson_interval
 
 __all__ = [
     "CONFIDENCE",
+    "Leader",
     "bca_interval",
     "cvar",
     "episodes_for",
+    "leader",
     "paired_difference",
     "quantile",
     "rate_interval",
@@ -113,6 +116,33 @@ def paired_difference(
         )
     difference = np.asarray(values, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
     return bca_interval(difference, resamples, seed)
+
+
+class Leader(NamedTuple):
+    """Who has the least mean, and whom the intervals do not tell apart from it."""
+
+    name: str
+    tied: tuple[str, ...]
+
+    @property
+    def winner(self) -> str | None:
+        """The name, where everybody else's difference has an interval that excludes zero."""
+        return None if self.tied else self.name
+
+
+def leader(means: Mapping[str, float], difference: Callable[[str, str], Interval]) -> Leader | None:
+    """Who has the least of some means, if anybody has one and there is somebody to beat.
+
+    Args:
+        means: by name; those that are nan take no part.
+        difference: of the first name's mean to the second's, with its 95 % interval.
+    """
+    known = {name: mean for name, mean in means.items() if mean == mean}
+    if len(known) < 2:
+        return None
+    best = min(known, key=known.__getitem__)
+    rivals = [name for name in known if name != best]
+    return Leader(best, tuple(name for name in rivals if not difference(name, best).low > 0.0))
 
 
 def bca_interval(

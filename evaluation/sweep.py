@@ -8,17 +8,19 @@ together: the last slow row does not wait for the rest.
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.cells import Store, cell_key, cell_size, controller_fingerprint
 from slipcar.evaluation.controller import Controller
-from slipcar.evaluation.executors import Executor, run
+from slipcar.evaluation.executors import Executor, Outcome, run
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.progress import Bars
 from slipcar.evaluation.rollout import Measured, Stretch, joined, measure
 from slipcar.evaluation.runs import Runs, trainings
+from slipcar.evaluation.ticks import Ticks
 
 #: Seconds that 1024 episodes of a row may take; a hundred times what a receding horizon needs.
 TIME_LIMIT = 300.0
@@ -117,6 +119,13 @@ class _Piece:
     index: int
     key: dict[str, Any] | None
     stretch: Stretch
+    ticks: Ticks | None = None
+    number: str = ""
+
+    @property
+    def cell(self) -> str:
+        """Names it among the cells under way."""
+        return f"{'|'.join(self.job)}|{self.index}"
 
 
 def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> Swept:
@@ -151,16 +160,17 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
                 yield piece
 
     computed = 0
-    for piece, measured, error in run(_measured, wanted(), executor):
+    for piece, measured, error in _computed(wanted(), executor, bars):
         row, *_ = piece.job
         if error is not None:
             failed.setdefault(piece.job, {})[piece.index] = message(error)
+            bars.advance(row, 0, piece.cell)
             bars.note(row, "failed")
             continue
         computed += 1
         done[piece.job][piece.index] = measured
         store.put(piece.key, measured)
-        bars.advance(row, piece.stretch.episodes)
+        bars.advance(row, piece.stretch.episodes, piece.cell)
     # Cells are handed out in order: the first that failed is the same, whoever was quicker.
     errors = {job: found[min(found)] for job, found in failed.items()}
     results = {
@@ -176,8 +186,37 @@ def sweep(jobs: Sequence[Job], store: Store, executor: Executor, bars: Bars) -> 
     return Swept(results, errors, reused, computed)
 
 
+def _computed(pieces: Iterator[_Piece], executor: Executor, bars: Bars) -> Iterator[Outcome]:
+    """Cells as they finish; meanwhile the bars are told how far those under way are."""
+    if executor.open is None:
+
+        def here(piece: _Piece) -> Measured:
+            return measure(piece.stretch, lambda done: bars.within(piece.job[0], piece.cell, done))
+
+        yield from run(here, pieces, executor)
+        return
+    with tempfile.TemporaryDirectory(prefix="slipcar-", ignore_cleanup_errors=True) as folder:
+        ticks = Ticks(folder) if executor.local else None
+        under_way: dict[str, _Piece] = {}
+
+        def handed_out() -> Iterator[_Piece]:
+            for number, piece in enumerate(pieces):
+                under_way[str(number)] = piece
+                yield dataclasses.replace(piece, ticks=ticks, number=str(number))
+
+        def look() -> None:
+            for number, episodes in ticks.read() if ticks is not None else ():
+                if (piece := under_way.get(number)) is not None:
+                    bars.within(piece.job[0], piece.cell, episodes)
+
+        for outcome in run(_measured, handed_out(), executor, look):
+            under_way.pop(outcome.task.number, None)
+            yield outcome
+
+
 def _measured(piece: _Piece) -> Measured:
-    return measure(piece.stretch)
+    ticks = piece.ticks
+    return measure(piece.stretch, None if ticks is None else ticks.writer(piece.number))
 
 
 def message(error: BaseException) -> str:

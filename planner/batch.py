@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from slipcar.planner.newton.posing import Posed
-from slipcar.planner.options import Options, check_count, plain
+from slipcar.planner.options import BatchOptions, Options, check_count, plain
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan, plan_of
 from slipcar.planner.problem.model import Model
@@ -30,7 +30,7 @@ def plan_batch(
     guesses: Sequence[Any] | None = None,
     workers: int = 0,
     history: bool = False,
-    **options: Any,
+    **options: Unpack[BatchOptions],
 ) -> list[Plan]:
     """Plan many problems at once; each plan is the one that `plan` would give.
 
@@ -56,12 +56,12 @@ def plan_batch(
         ValueError: for a wrong option, shape or value, naming its index in the batch.
     """
     began = time.perf_counter()
-    options = {name: plain(value) for name, value in options.items()}
-    free_first = options.pop("free_first", None)
+    given = {name: plain(value) for name, value in options.items()}
+    free_first: Any = given.pop("free_first", None)
     known = {field.name for field in dataclasses.fields(Options)} - {"callback"}
-    if unknown := sorted(set(options) - known):
+    if unknown := sorted(set(given) - known):
         raise TypeError(f"plan_batch knows no option {unknown}; it knows {sorted(known)}")
-    chosen = Options(**options)
+    chosen = Options(**given)
     if workers != 0:
         check_count("workers", workers)
     if guesses is not None and not isinstance(guesses, Sequence):

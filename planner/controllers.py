@@ -45,6 +45,9 @@ class OpenLoop:
         self._actuation = actuation_of(plan)
         self._angles = self._actuation.angles
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.plan!r})"
+
     @property
     def preparation_time(self) -> float:
         """Seconds of planning."""

@@ -5,14 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solver
-from slipcar.planner.convex.trust_region import TRUST_REGIONS
-from slipcar.planner.problem.integrators import INTEGRATORS
 from slipcar.planner.records import Iteration
+
+#: What options may be, for type checkers and for the checks below.
+Method = Literal["auto", "newton", "convex"]
+Backend = Literal["structured", "osqp", "cvxpy"]
+TrustRegionName = Literal["adaptive", "paper", "none"]
+Linearization = Literal["composite", "literal"]
+IntegratorName = Literal["euler", "rk4"]
+ColdStart = Literal["auto", "always", "never"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,14 +63,14 @@ class Options:
     """
 
     variance_weight: float = 1.0
-    solver: str | Solver = "structured"
-    method: str = "auto"
+    solver: Backend | Solver = "structured"
+    method: Method = "auto"
     tolerance: float = 1e-4
     max_iterations: int = 200
-    trust_region: str | None = None
-    linearization: str = "composite"
+    trust_region: TrustRegionName | None = None
+    linearization: Linearization = "composite"
     terminal_tolerance: float = 0.0
-    integrator: str = "euler"
+    integrator: IntegratorName = "euler"
     compiled: bool | None = None
     callback: Callable[[Iteration], bool | None] | None = None
 
@@ -73,11 +79,11 @@ class Options:
         check_number("tolerance", self.tolerance)
         check_number("terminal_tolerance", self.terminal_tolerance, zero_allowed=True)
         check_count("max_iterations", self.max_iterations)
-        check_choice("method", self.method, ("auto", "newton", "convex"))
+        check_choice("method", self.method, get_args(Method))
         if self.trust_region is not None:
-            check_choice("trust_region", self.trust_region, TRUST_REGIONS)
-        check_choice("linearization", self.linearization, ("composite", "literal"))
-        check_choice("integrator", self.integrator, INTEGRATORS)
+            check_choice("trust_region", self.trust_region, get_args(TrustRegionName))
+        check_choice("linearization", self.linearization, get_args(Linearization))
+        check_choice("integrator", self.integrator, get_args(IntegratorName))
         check_flag("compiled", self.compiled, none_allowed=True)
         if self.callback is not None and not callable(self.callback):
             raise ValueError(f"callback must be a function of an Iteration, not {self.callback!r}")
@@ -160,7 +166,7 @@ class Guesses:
 
     starts: int | None = None
     guess: Any = None
-    cold_start: str = "auto"
+    cold_start: ColdStart = "auto"
     free_first: bool | None = None
     shooting: bool = False
     free_final_time: bool = False
@@ -171,7 +177,7 @@ class Guesses:
     def __post_init__(self) -> None:
         if self.starts is not None:
             check_count("starts", self.starts)
-        check_choice("cold_start", self.cold_start, ("auto", "always", "never"))
+        check_choice("cold_start", self.cold_start, get_args(ColdStart))
         check_flag("free_first", self.free_first, none_allowed=True)
         for name in ("shooting", "free_final_time", "check_derivatives"):
             check_flag(name, getattr(self, name))
@@ -181,6 +187,24 @@ class Guesses:
             )
         if self.free_final_time:
             check_number("time_weight", self.time_weight)
+
+
+class BatchOptions(TypedDict, total=False):
+    """Options of `plan_batch`, as a type checker sees them; those of :class:`Options` and one of
+    :class:`Guesses`.
+    """
+
+    variance_weight: float
+    solver: Backend | Solver
+    method: Method
+    tolerance: float
+    max_iterations: int
+    trust_region: TrustRegionName | None
+    linearization: Linearization
+    terminal_tolerance: float
+    integrator: IntegratorName
+    compiled: bool | None
+    free_first: bool | None
 
 
 def plain(value: Any) -> Any:

@@ -7,12 +7,13 @@ import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slipcar.planner import plan_file
+from slipcar.planner import export, plan_file
 from slipcar.planner.actuation import Actuation
+from slipcar.planner.display import facts
 from slipcar.planner.extremal.certificate import Certificate, certify
 from slipcar.planner.extremal.shooting import Shot
 from slipcar.planner.moments.covariance import trace_integral
@@ -23,6 +24,10 @@ from slipcar.planner.problem.protocol import Problem
 from slipcar.planner.records import Alternative, ExpectedCost, Iteration, Multipliers, TimeStep
 from slipcar.planner.search.risk import Risk
 from slipcar.planner.status import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 Array = np.ndarray
 
@@ -125,6 +130,45 @@ class Plan:
             f"obstacle_cost={self.obstacle_cost:.3g}, variance={self.variance:.4g}, "
             f"iterations={self.iterations}, solve_time={1e3 * self.solve_time:.1f} ms)"
         )
+
+    def _repr_html_(self) -> str:
+        return facts("Plan", export.html_facts(self))
+
+    def plot(self, axes: Any = None, *, plane: tuple[int, int] | None = None) -> Any:
+        """Draw the mean and how far paths stray from it, for any problem, with matplotlib.
+
+        In a plane of two states: the path, ellipses that hold 95 % of the paths, and whatever the
+        problem draws there (`draw(axes)`, if it has that). Without a plane: each state over time
+        with its 95 % band, each control as steps.
+
+        Args:
+            axes: where to draw; None makes a figure.
+            plane: which two states; None takes the problem's `plane`, and time if it has none.
+
+        Returns:
+            The Axes; without a plane an array (n + m,) of them, states first.
+
+        Raises:
+            ValueError: for a plane of other than two states, or too few axes.
+            ImportError: without matplotlib.
+        """
+        return export.plot(self, axes, plane)
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row a node: each state's mean and standard deviation, and the controls from there on.
+
+        Columns are called as the problem's `state_names` and `control_names` say, x[0] and u[0]
+        without. The last row has no controls (nan). Needs pandas.
+        """
+        return export.to_frame(self)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Mean, covariance, controls and gains with named dimensions and times. Needs xarray.
+
+        Raises:
+            ImportError: without it.
+        """
+        return export.to_xarray(self)
 
     def replace(self, **changes: Any) -> Plan:
         """A copy with some fields changed, for example `gains`."""

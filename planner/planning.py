@@ -10,7 +10,17 @@ import numpy as np
 
 from slipcar.planner.convex.solvers.interface import Solver
 from slipcar.planner.newton.posing import Posed
-from slipcar.planner.options import Guesses, Options, plain
+from slipcar.planner.options import (
+    Backend,
+    ColdStart,
+    Guesses,
+    IntegratorName,
+    Linearization,
+    Method,
+    Options,
+    TrustRegionName,
+    plain,
+)
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.plan import Plan, plan_of, steered_fields
 from slipcar.planner.problem.checks import check_derivatives as compare_derivatives
@@ -36,18 +46,18 @@ def plan(
     problem: Problem,
     *,
     variance_weight: float | None = None,
-    solver: str | Solver = "structured",
-    method: str = "auto",
+    solver: Backend | Solver = "structured",
+    method: Method = "auto",
     tolerance: float = 1e-4,
     max_iterations: int = 200,
-    trust_region: str | None = None,
-    linearization: str = "composite",
+    trust_region: TrustRegionName | None = None,
+    linearization: Linearization = "composite",
     terminal_tolerance: float = 0.0,
-    integrator: str = "euler",
+    integrator: IntegratorName = "euler",
     compiled: bool | None = None,
     starts: int | None = None,
     guess: Plan | tuple[Array, Array] | None = None,
-    cold_start: str = "auto",
+    cold_start: ColdStart = "auto",
     free_first: bool | None = None,
     shooting: bool = False,
     free_final_time: bool = False,

@@ -8,6 +8,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from slipcar.planner.display import brief
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -39,6 +40,8 @@ class Iteration:
     linearize_seconds: float  #: time spent on the model
     solve_seconds: float  #: time spent in the sub-problem solver
 
+    __repr__ = brief
+
     @property
     def seconds(self) -> float:
         """Time of the iteration, callback excluded."""
@@ -67,6 +70,9 @@ class Columns(Sequence[Iteration]):
 
     def __reduce__(self) -> tuple[type[Columns], tuple[dict[str, Array]]]:
         return Columns, (self.columns,)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} iterations>"
 
     def __len__(self) -> int:
         return len(self.columns["effort"]) if self._rows is None else self._rows
@@ -97,6 +103,8 @@ class Multipliers:
     cost: float  #: p⁰ ≤ 0
     trust_region: float  #: p¹ ≤ 0
     adjoint: Array  #: p at every node, (N, n)
+
+    __repr__ = brief
 
     @classmethod
     def of(cls, adjoint: Array, terminal: Array, trust_multiplier: float, A: Array) -> Multipliers:
@@ -137,6 +145,8 @@ class Alternative:
     iterations: int  #: sub-problems solved
     #: label of a better-placed alternative that is the same answer, or None
     same_as: str | None = None
+
+    __repr__ = brief
 
 
 @dataclasses.dataclass(frozen=True)

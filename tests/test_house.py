@@ -19,8 +19,17 @@ PACKAGES = {
 }
 
 # What users import and what they get back; its records are known to all rooms but `trace`.
-RECORDS = {"status", "options", "records", "outcome", "actuation"}
-HALL = {"__init__", "planning", "plan", "batch", "receding_horizon", "controllers", "plan_file"}
+RECORDS = {"status", "options", "records", "outcome", "actuation", "display"}
+HALL = {
+    "__init__",
+    "planning",
+    "plan",
+    "batch",
+    "receding_horizon",
+    "controllers",
+    "plan_file",
+    "export",
+}
 # Room -> the rooms below it, which it may import.
 GROUND = {"problem", "trace"}
 ROOMS = {

@@ -6,6 +6,7 @@ Which file may import which: see test_house.py.
 import ast
 import importlib
 import importlib.metadata
+import json
 import os
 import re
 import shutil
@@ -24,15 +25,22 @@ NAMES = {"envs", "planner", "baselines", "evaluation"}
 HEAVY = ["torch", "gymnasium", "matplotlib", "pandas", "osqp", "cvxpy"]
 
 
+#: The folder of `slipcar` itself: one file, which imports nothing.
+TOP = "package"
+
+
 def sources():
-    """Python files of all four packages."""
-    return sorted(path for package in NAMES for path in (ROOT / package).rglob("*.py"))
+    """Python files of the package and its four parts."""
+    return sorted(path for part in (TOP, *NAMES) for path in (ROOT / part).rglob("*.py"))
 
 
 def folders():
-    """Every folder with an `__init__.py`, as the module that it should be."""
-    inits = [path for path in sources() if path.name == "__init__.py"]
-    return {"slipcar." + ".".join(path.parent.relative_to(ROOT).parts) for path in inits}
+    """Every folder with an `__init__.py`: the module that it should be -> the folder."""
+    inits = [path.parent.relative_to(ROOT) for path in sources() if path.name == "__init__.py"]
+    return {
+        "slipcar" if path.name == TOP else f"slipcar.{'.'.join(path.parts)}": path.as_posix()
+        for path in inits
+    }
 
 
 def wanted(source):
@@ -164,10 +172,8 @@ def _distribution(requirement):
 
 def test_every_folder_is_listed():
     setup = PYPROJECT["tool"]["setuptools"]
-    assert set(setup["packages"]) == folders()
-    assert setup["package-dir"] == {
-        name: name.removeprefix("slipcar.").replace(".", "/") for name in folders()
-    }
+    assert set(setup["packages"]) == set(folders())
+    assert setup["package-dir"] == folders()
     assert set(PYPROJECT["tool"]["mypy"]["packages"]) == {f"slipcar.{name}" for name in NAMES}
 
 
@@ -179,6 +185,7 @@ def test_is_typed(name):
 def test_one_version_everywhere():
     version = PYPROJECT["project"]["version"]
     assert importlib.metadata.version("slipcar") == version
+    assert importlib.import_module("slipcar").__version__ == version
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## \[(\d[^]]*)\]", changelog, re.MULTILINE)[0] == version
 
@@ -221,7 +228,7 @@ def wheel(tmp_path_factory):
     """A wheel built from a copy, so that nothing left in the checkout's build/ gets into it."""
     checkout = tmp_path_factory.mktemp("checkout")
     ignore = shutil.ignore_patterns("__pycache__")
-    for name in NAMES:
+    for name in (TOP, *NAMES):
         shutil.copytree(ROOT / name, checkout / name, ignore=ignore)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, checkout)
@@ -243,8 +250,8 @@ def shipped(wheel):
 def test_the_wheel_holds_the_package_and_nothing_else(shipped):
     kept = {".py", ".typed", ".html", ".css", ".js"}
     expected = {
-        f"slipcar/{path.relative_to(ROOT)}"
-        for name in NAMES
+        f"slipcar/{path.relative_to(ROOT).as_posix().removeprefix(f'{TOP}/')}"
+        for name in (TOP, *NAMES)
         for path in (ROOT / name).rglob("*")
         if path.suffix in kept or ("weights" in path.parts and path.is_file())
     }
@@ -280,21 +287,52 @@ def test_the_wheel_works_without_extras(wheel, tmp_path):
 # --- what a user's type checker sees -------------------------------------------------------
 
 
-def test_a_users_type_checker_sees_the_types(tmp_path):
-    """A script elsewhere: mypy follows the import, as it would not without `py.typed`."""
-    script = tmp_path / "user.py"
-    script.write_text(
-        "from slipcar.envs import Scenario\n"
-        "from slipcar.planner import plan\n"
-        "p = plan(Scenario.named('paper'))\n"
-        "reveal_type(p)\n"
-        "wrong: int = p.effort\n"
-    )
-    # The project's own settings, because `make lint` has filled the cache under them.
+RIGHT = (ROOT / "tests" / "typing" / "user_script.py").read_text(encoding="utf-8")
+WRONG = """
+class Unfinished:
+    pass
+
+wrong: int = p.effort  # error
+plan(Unfinished())  # error
+plan(scenario, method="Newton")  # error
+plan(scenario, solver="ipopt")  # error
+plan(scenario, trust_region="large")  # error
+plan(scenario, cold_start="never ever")  # error
+plan_batch([scenario], integrator="heun")  # error
+scenario.times = p.times  # error
+slipcar.__version__ + 1  # error
+"""
+
+
+def mypy_errors(script):
+    """Line numbers of what mypy says, by the project's settings: `make lint` fills their cache."""
     done = subprocess.run(
         [sys.executable, "-m", "mypy", script], capture_output=True, text=True, cwd=ROOT
     )
-    lines = done.stdout.splitlines()
-    assert len(lines) == 3, done.stdout + done.stderr
-    assert lines[0].endswith('user.py:4: note: Revealed type is "slipcar.planner.plan.Plan"')
-    assert "user.py:5: error: Incompatible types in assignment" in lines[1]
+    found = re.findall(rf"{script.name}:(\d+): error", done.stdout)
+    assert found or "Success" in done.stdout, done.stdout + done.stderr
+    return sorted({int(line) for line in found})
+
+
+def pyright_errors(script):
+    """Line numbers of what pyright says, in its usual mode."""
+    above = Path(importlib.import_module("slipcar.planner").__path__[0]).parents[1]
+    settings = {"include": [script.name], "typeCheckingMode": "standard"}
+    config = script.with_name("pyrightconfig.json")
+    config.write_text(json.dumps(settings | {"extraPaths": [str(above)]}), encoding="utf-8")
+    command = [Path(sys.executable).with_name("basedpyright"), "-p", config, "--outputjson"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=script.parent)
+    said = json.loads(done.stdout)
+    assert said["summary"]["filesAnalyzed"] == 1, done.stdout
+    return sorted({each["range"]["start"]["line"] + 1 for each in said["generalDiagnostics"]})
+
+
+@pytest.mark.parametrize("errors", [mypy_errors, pyright_errors])
+def test_a_users_type_checker_sees_the_types(tmp_path, errors):
+    """A script elsewhere: what is right is accepted, and each wrong line is found, none else."""
+    script = tmp_path / "user.py"
+    script.write_text(RIGHT, encoding="utf-8")
+    assert errors(script) == []
+    script.write_text(RIGHT + WRONG, encoding="utf-8")
+    wrong = (RIGHT + WRONG).splitlines()
+    assert errors(script) == [i for i, line in enumerate(wrong, 1) if line.endswith("# error")]

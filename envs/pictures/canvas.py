@@ -1,15 +1,18 @@
 """Something to draw on: pixels that NumPy and pygame share, handed out or shown in a window.
 
-Needs pygame (`pip install "slipcar[plot]"`), imported when the first canvas is made. Off screen
+Needs pygame (the extra `plot`), imported when the first canvas is made. Off screen
 no display is needed.
 """
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled, Error
+
+from slipcar.envs.extras import install
 
 
 class Canvas:
@@ -62,16 +65,37 @@ class Canvas:
             self._pygame.display.quit()
 
     def _open(self, size: tuple[int, int]) -> None:
-        pygame = self._pygame
+        pygame = open_display()
         try:
-            pygame.display.init()
             self._window = pygame.display.set_mode(size)
         except pygame.error as error:
-            raise Error(
-                f"render_mode='human' found no display ({error}); use render_mode='rgb_array'"
-            ) from error
+            raise _no_display(str(error)) from error
         pygame.display.set_caption("slipcar")
         self._clock = pygame.time.Clock()
+
+
+def open_display() -> Any:
+    """Pygame with its display open: one that somebody sees, or that was asked for.
+
+    Raises:
+        DependencyNotInstalled: without pygame.
+        gymnasium.error.Error: without a display.
+    """
+    pygame = import_pygame()
+    try:
+        pygame.display.init()
+    except pygame.error as error:
+        raise _no_display(str(error)) from error
+    driver = pygame.display.get_driver()
+    # Where there is no display, SDL takes one of these without a word.
+    if driver in ("offscreen", "dummy") and os.environ.get("SDL_VIDEODRIVER") != driver:
+        pygame.display.quit()
+        raise _no_display("no screen is attached")
+    return pygame
+
+
+def _no_display(reason: str) -> Error:
+    return Error(f"render_mode='human' found no display ({reason}); use render_mode='rgb_array'")
 
 
 def import_pygame() -> Any:
@@ -83,7 +107,5 @@ def import_pygame() -> Any:
     try:
         import pygame
     except ImportError as error:
-        raise DependencyNotInstalled(
-            'rendering needs pygame: pip install "slipcar[plot]"'
-        ) from error
+        raise DependencyNotInstalled(f"rendering needs pygame: {install('plot')}") from error
     return pygame

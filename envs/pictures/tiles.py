@@ -1,6 +1,6 @@
 """Many worlds at once: a grid of small scenes, one for each sub-environment.
 
-Needs pygame (`pip install "slipcar[plot]"`), imported when the first grid is made.
+Needs pygame (the extra `plot`), imported when the first grid is made.
 """
 
 from __future__ import annotations

@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from slipcar.evaluation.commands.inputs import (
-    PaperScenarioOption,
-    console,
-    read_maker,
-    read_scenario,
-)
+from slipcar.evaluation.commands.checks import check_figures, check_folder
+from slipcar.evaluation.commands.inputs import PaperScenarioOption, read_maker, read_scenario
+from slipcar.evaluation.commands.output import Output, OutputOption, finish, program
 from slipcar.evaluation.executors import LostWorkersError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from slipcar.evaluation.report.document import Document
 
+_MORE = (
+    "All tables are in {folder}/table.md; --all-tables prints them here, `{program} report "
+    "{folder}` makes a page of them."
+)
 _Controllers = tyro.conf.UseAppendAction[
     Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=]SOURCE")]
 ]
@@ -36,6 +35,8 @@ def compare(
     seed: int = 0,
     folder: Path | None = None,
     controller: _Controllers = (),
+    rows: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+    reference: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     trust: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     variance_weight: float = 1.0,
     policy: Path | None = None,
@@ -45,6 +46,8 @@ def compare(
     time_limit: float = 300.0,
     figures: bool = True,
     resume: bool = True,
+    all_tables: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Compare planners and policies over the same Brownian paths: one table and its figures.
 
@@ -60,13 +63,15 @@ def compare(
 
     horizon: plans with few and many nodes, driven in a finer simulation.
 
-    Prints the tables and writes table.md, .csv, .tex, document.json and the figures into the
-    folder. Finished work is kept there: after an interruption the same command continues, and a
-    changed option costs only what it touches. `slipcar report` makes a page of all folders.
+    Prints the main table and what it says, after table.md (all tables), .csv, .tex, document.json
+    and the figures are in the folder. Finished work is kept there: after an interruption the same
+    command continues, and a changed option costs only what it touches. `slipcar report` makes a
+    page of all folders.
 
         slipcar compare
         slipcar compare --suite random --workers 2
         slipcar compare --controller mine=my_module:controller
+        slipcar compare --rows "*SCP*" PPO --reference PPO
         slipcar compare --scenario slalom --resolution 0.1%
         slipcar compare --suite slip --cluster dask://scheduler:8786
 
@@ -86,6 +91,10 @@ def compare(
         controller: a row of your own, may be given several times: module:object, file.py:object, a
             Stable-Baselines3 model.zip (with --trust), plan.npz, policy.safetensors, or the name
             of an installed one; docs/controllers.md shows each in ten lines.
+        rows: only these of the usual rows: whole names or patterns with * and ?, in quotes, case
+            ignored. Nothing else is planned.
+        reference: row that paired differences are taken against; stochastic SCP by default, or
+            the first row if it is not among them.
         trust: load Stable-Baselines3 models, which runs whatever code is in the file.
         variance_weight: weight of the integral of tr Sigma in stochastic SCP [1/(m2 s)].
         policy: a trained policy (.safetensors file or folder) instead of the shipped ones.
@@ -96,6 +105,8 @@ def compare(
         time_limit: seconds that 1024 episodes of a row may take before it counts as failed.
         figures: draw the figures as well (needs matplotlib).
         resume: reuse finished work found in the folder.
+        all_tables: print all tables: tails, paired differences, training noise, times, ...
+        output: what is printed.
     """
     from slipcar.evaluation.rollout import checked_counts
 
@@ -104,21 +115,26 @@ def compare(
     if not time_limit > 0.0:
         raise ValueError(f"--time-limit must be > 0 seconds, not {time_limit:g}")
     place = folder or Path("results") / ("compare" if suite == "paper" else suite)
+    check_folder(place)
+    check_figures(figures, "--no-figures")
     common: dict[str, Any] = {
         "n_jobs": workers,
         "cluster": cluster,
         "folder": place,
         "resume": resume,
         "time_limit": time_limit,
+        "progress": not output.quiet,
     }
-    out = console()
     try:
         if suite == "paper":
             return _paper(
-                out,
+                output,
+                all_tables,
                 scenario="paper" if scenario is None else scenario,
                 controllers=controller,
                 trust=trust,
+                rows=rows,
+                reference=reference,
                 variance_weight=variance_weight,
                 policy=policy,
                 figures=figures,
@@ -141,7 +157,10 @@ def compare(
             raise ValueError(
                 f"{', '.join(given)}: only the suite paper has it; {suite} says so itself"
             )
-        return _suite(out, suite, episodes, seed, controller, trust, figures, common)
+        return _suite(
+            output, all_tables, suite, episodes, seed, controller, trust, rows, reference, figures,
+            common,
+        )  # fmt: skip
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"finished work is kept in {place}; run the command again to continue"
@@ -153,11 +172,14 @@ def compare(
 
 
 def _paper(
-    out: Console,
+    output: Output,
+    all_tables: bool,
     *,
     scenario: str,
     controllers: tuple[str, ...],
     trust: bool,
+    rows: tuple[str, ...],
+    reference: str | None,
     variance_weight: float,
     policy: Path | None,
     figures: bool,
@@ -165,57 +187,78 @@ def _paper(
 ) -> int:
     from slipcar.baselines import load_policy
     from slipcar.evaluation import compare as compare_controllers
+    from slipcar.evaluation import rows as usual
     from slipcar.evaluation.report import comparison as report
-    from slipcar.evaluation.rows import REFERENCE, default_rows
 
     world = read_scenario(scenario)
     own = dict(read_maker(text, trust) for text in controllers)
-    rows, notes = default_rows(
-        world,
-        variance_weight=variance_weight,
-        policy=None if policy is None else load_policy(policy),
+    learned = None if policy is None else load_policy(policy)
+    how: dict[str, Any] = {"variance_weight": variance_weight, "policy": learned}
+    names = usual.chosen(list(usual.row_makers(world, **how)[0]), rows)
+    against = _reference(reference, usual.REFERENCE, [*names, *own])
+    check_names(names, list(own), len(controllers))
+    with output.busy("planning ..."):
+        made, notes = usual.default_rows(world, **how, only=rows)
+    done = compare_controllers({**made, **own}, world, reference=against, notes=notes, **options)
+    folder = options["folder"]
+    finish(
+        output,
+        lambda: done.save(folder, figures=figures),
+        lambda: report.terminal(done, all_tables),
+        report.messages(done),
+        "" if all_tables else _MORE.format(folder=folder, program=program()),
     )
-    check_names(list(rows), list(own), len(controllers))
-    done = compare_controllers({**rows, **own}, world, reference=REFERENCE, notes=notes, **options)
-    out.print(report.terminal(done))
-    with out.status("writing tables and drawing figures ..."):
-        written = done.save(options["folder"], figures=figures)
-    _say_written(out, options["folder"], written)
+    if output.json:
+        print(report.json_text(done), end="")
     return 1 if done.errors else 0
 
 
 def _suite(
-    out: Console,
+    output: Output,
+    all_tables: bool,
     suite: str,
     episodes: int | None,
     seed: int,
     controllers: tuple[str, ...],
     trust: bool,
+    rows: tuple[str, ...],
+    reference: str | None,
     figures: bool,
     common: dict[str, Any],
 ) -> int:
     import dataclasses
     import importlib
 
+    from slipcar.evaluation.rows import chosen
     from slipcar.evaluation.suites.suite import run_suite, save_suite
 
     module = importlib.import_module(f"slipcar.evaluation.suites.{suite}")
-    chosen = module.suite() if episodes is None else module.suite(episodes)
+    whole = module.suite() if episodes is None else module.suite(episodes)
     own = dict(read_maker(text, trust) for text in controllers)
-    check_names(list(chosen.rows), list(own), len(controllers))
-    result = run_suite(dataclasses.replace(chosen, rows={**chosen.rows, **own}), seed, **common)
+    usual = {name: whole.rows[name] for name in chosen(list(whole.rows), rows)}
+    check_names(list(usual), list(own), len(controllers))
+    against = _reference(reference, whole.reference, [*usual, *own])
+    made = dataclasses.replace(whole, rows={**usual, **own}, reference=against)
+    result = run_suite(made, seed, **common)
     document: Document = module.document(result)
-    out.print(document.terminal())
-    with out.status("writing tables and drawing figures ..."):
-        written = save_suite(result, document, common["folder"], figures)
-    _say_written(out, common["folder"], written)
+    folder = common["folder"]
+    finish(
+        output,
+        lambda: save_suite(result, document, folder, figures),
+        lambda: document.terminal(None if all_tables else 1),
+        document.notes,
+        "" if all_tables else _MORE.format(folder=folder, program=program()),
+    )
+    if output.json:
+        print(document.to_json(), end="")
     return 1 if result.errors else 0
 
 
-def _say_written(out: Console, folder: Path, written: list[Path]) -> None:
-    out.print(f"{len(written)} files in {folder}:", markup=False)
-    for path in written:
-        out.print(f"  {path}", markup=False, soft_wrap=True)
+def _reference(wanted: str | None, usual: str, names: list[str]) -> str:
+    """The row to compare with: the one that is wanted, else the usual one, else the first."""
+    if wanted is not None and wanted not in names:
+        raise ValueError(f"--reference: no row is called {wanted!r}; the rows are {names}")
+    return wanted or (usual if usual in names else names[0])
 
 
 def check_names(rows: list[str], own: list[str], given: int) -> None:

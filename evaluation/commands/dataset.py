@@ -8,14 +8,16 @@ from typing import Annotated
 import tyro
 
 from slipcar.envs.observation import KINDS, Layout
+from slipcar.evaluation.commands.checks import check_folder
 from slipcar.evaluation.commands.inputs import (
     CONTROLLER_HELP,
     CONTROLLERS,
     OwnScenarioOption,
-    console,
     read_controller,
     read_scenario,
 )
+from slipcar.evaluation.commands.output import Output, OutputOption
+from slipcar.evaluation.progress import Bars
 
 
 def dataset(
@@ -36,6 +38,7 @@ def dataset(
     author: str | None = None,
     code_permalink: str | None = None,
     description: str | None = None,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Write episodes of any controller as a Minari dataset, to learn from offline.
 
@@ -66,18 +69,19 @@ def dataset(
         author: who made it.
         code_permalink: where the code that made it can be read.
         description: what others should know of it.
+        output: what is printed.
     """
     from slipcar.evaluation.dataset import check_request, write_dataset
     from slipcar.evaluation.episodes import checked_recording
     from slipcar.evaluation.statistics import standard_error
 
-    out = console()
+    out = output.console()
     world = None if scenario is None else read_scenario(scenario)
     Layout(observation, obstacle_slots)  # all that can be checked before any planning
     checked_recording(episodes, seed, exploration_noise)
-    check_request(dataset_id, folder, overwrite)
+    check_folder(check_request(dataset_id, folder, overwrite))
     driver, world = read_controller(controller, world, trust)
-    with _Bar(episodes) as bar:
+    with Bars({"recording": episodes}, not output.quiet) as bars:
         written = write_dataset(
             driver,
             world,
@@ -93,7 +97,7 @@ def dataset(
             author=author,
             code_permalink=code_permalink,
             description=description,
-            progress=bar.advance,
+            progress=lambda more: bars.advance("recording", more),
         )
     returns = written.returns
     out.print(
@@ -112,32 +116,18 @@ def dataset(
         )
     if written.failures:
         out.print(f"solves behind the controller that failed: {written.failures}", markup=False)
+    output.data(
+        {
+            "id": written.dataset_id,
+            "path": str(written.path),
+            "episodes": written.episodes,
+            "steps": written.steps,
+            "mean_return": returns.mean(),
+            "mean_return_se": standard_error(returns),
+            "worst_return": returns.min(),
+            "collision_rate": written.collision_rate,
+            "failures": written.failures,
+        }
+    )
     status = getattr(driver, "status", None)
     return 0 if status is None or status.ok else 1
-
-
-class _Bar:
-    """Episodes stored so far, on the standard error."""
-
-    def __init__(self, episodes: int) -> None:
-        from rich import progress
-        from rich.console import Console
-
-        self._bar = progress.Progress(
-            progress.TextColumn("recording"),
-            progress.BarColumn(),
-            progress.TextColumn("{task.completed:,.0f} of {task.total:,.0f} episodes"),
-            progress.TimeElapsedColumn(),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task("recording", total=episodes)
-
-    def __enter__(self) -> _Bar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-
-    def advance(self, episodes: int) -> None:
-        self._bar.advance(self._task, episodes)

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from slipcar.evaluation.commands.inputs import ScenarioOption, console, read_scenario
+from slipcar.evaluation.commands.checks import check_figures, check_folder
+from slipcar.evaluation.commands.inputs import ScenarioOption, read_scenario
+from slipcar.evaluation.commands.output import Output, OutputOption, finish
 from slipcar.evaluation.frontier import EPISODES, PRICES, RECEDING_EPISODES, RECEDING_PRICES
 
 
@@ -25,6 +27,7 @@ def frontier(
     workers: int = 1,
     figures: bool = True,
     resume: bool = True,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Show what safety costs: effort and total cost against collision rate, in one picture.
 
@@ -57,12 +60,14 @@ def frontier(
         workers: processes that share each point's episodes; the numbers do not depend on it.
         figures: draw the figure as well (needs matplotlib).
         resume: reuse finished points found in the folder.
+        output: what is printed.
     """
     from slipcar.baselines import load_policy
     from slipcar.evaluation.frontier import frontier as trace_frontier
     from slipcar.evaluation.report import frontier as report_frontier
 
-    out = console()
+    check_folder(folder)
+    check_figures(figures, "--no-figures")
     try:
         done = trace_frontier(
             read_scenario(scenario),
@@ -76,15 +81,14 @@ def frontier(
             n_jobs=workers,
             folder=folder,
             resume=resume,
+            progress=not output.quiet,
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"finished points are kept in {folder}; run the command again to continue"
         ) from None
-    out.print(report_frontier.terminal(done))
-    with out.status("writing tables and drawing the figure ..."):
-        written = done.save(folder, figures=figures)
-    out.print(f"{len(written)} files in {folder}:", markup=False)
-    for path in written:
-        out.print(f"  {path}", markup=False, soft_wrap=True)
+    shown = report_frontier.document(done)
+    finish(output, lambda: done.save(folder, figures=figures), shown.terminal, shown.notes)
+    if output.json:
+        print(shown.to_json(), end="")
     return 1 if done.comparison.errors else 0

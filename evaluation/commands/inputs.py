@@ -12,11 +12,10 @@ import tyro
 from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import read_text
+from slipcar.evaluation.commands.output import console as console
 from slipcar.evaluation.makers import Maker
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from slipcar.baselines import Policy
     from slipcar.evaluation.controller import Controller
 
@@ -175,11 +174,3 @@ def _words_are_known() -> Iterator[None]:
         if not (head.startswith("unknown controller") and colon):
             raise
         raise ValueError(f"{head}: it is one of {list(CONTROLLERS)}, {rest}") from None
-
-
-def console(width: int = 120) -> Console:
-    """Where tables go: at least `width` columns if the output is a file or a pipe."""
-    from rich.console import Console
-
-    out = Console(highlight=False)
-    return out if out.is_terminal else Console(highlight=False, width=max(width, out.width))

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from slipcar.evaluation.commands.inputs import ScenarioOption, console, read_scenario
+from slipcar.evaluation.commands.checks import FIGURES, check_figures, check_file, check_folder
+from slipcar.evaluation.commands.inputs import ScenarioOption, read_scenario
+from slipcar.evaluation.commands.output import Output, OutputOption, say
 
-_FIGURES = (".png", ".pdf", ".svg")
+if TYPE_CHECKING:
+    from slipcar.planner import Plan
+
 _COMPILED = {"auto": None, "yes": True, "no": False}
 
 
@@ -40,6 +44,7 @@ def plan(
     figures: Path | None = None,
     compare_methods: Path | None = None,
     worlds: int = 40,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Plan a scenario by stochastic SCP; print each iteration, the plan and what it proves.
 
@@ -101,18 +106,18 @@ def plan(
         compare_methods: write residual against iteration and time for the methods, on this
             scenario and faintly on random ones, as .png, .pdf or .svg.
         worlds: how many random ones, for --compare-methods.
+        output: what is printed.
     """
-    from slipcar.evaluation.commands import plan_text as text
     from slipcar.planner import Plan
     from slipcar.planner import plan as make_plan
 
-    out = console()
     world = read_scenario(scenario)
-    if save is not None and save.suffix != ".npz":
-        raise ValueError(f"a plan's name ends in .npz, not {save.name!r}")
-    for path in (figure, compare_methods):
-        if path is not None and path.suffix not in _FIGURES:
-            raise ValueError(f"a figure's name ends in .png, .pdf or .svg, not {path.name!r}")
+    check_file(save, (".npz",), "a plan")
+    check_file(figure, FIGURES, "a figure")
+    check_file(compare_methods, FIGURES, "a figure")
+    if figures is not None:
+        check_folder(figures)
+    check_figures(any(path is not None for path in (figure, figures, compare_methods)))
     if worlds < 0:
         raise ValueError(f"worlds must be >= 0, not {worlds}")
     options: dict[str, Any] = {
@@ -140,28 +145,42 @@ def plan(
     }
     first = make_plan(world, **options)
     found = first if risk is not None else make_plan(world, **options)
-    if found.alternatives:
-        out.print(text.alternatives_table(found))
-    out.print(text.iterations_table(found))
-    if found.time_search:
-        out.print(text.horizons_table(found))
-    out.print(text.summary(found, first.solve_time), markup=False)
-    if found.expected is None:
-        out.print(f"\n{found.certificate}", markup=False)
+    written: list[str] = []
     if save is not None:
         save.parent.mkdir(parents=True, exist_ok=True)
         found.save(save)
-        out.print(f"plan in {save}", markup=False)
-    if figure is not None:
-        _draw(found, figure)
-        out.print(f"figure in {figure}", markup=False)
-    if figures is not None:
-        for path in _draw_all(found, figures):
-            out.print(f"figure in {path}", markup=False)
-    if compare_methods is not None:
-        _compare_methods(world, worlds, compare_methods)
-        out.print(f"figure in {compare_methods}", markup=False)
+        written.append(f"plan in {save}")
+    try:
+        if figure is not None:
+            _draw(found, figure)
+            written.append(f"figure in {figure}")
+        if figures is not None:
+            written += [f"figure in {path}" for path in _draw_all(found, figures)]
+        if compare_methods is not None:
+            _compare_methods(world, worlds, compare_methods)
+            written.append(f"figure in {compare_methods}")
+    finally:
+        _print(output, found, first.solve_time, written)
     return 0 if found.status.ok else 1
+
+
+def _print(output: Output, found: Plan, first_seconds: float, written: list[str]) -> None:
+    from slipcar.evaluation.commands import plan_text as text
+
+    out = output.console()
+    if found.alternatives:
+        out.print(text.alternatives_table(found), "")
+    out.print(text.iterations_table(found), "")
+    if found.time_search:
+        out.print(text.horizons_table(found), "")
+    say(out, text.summary(found, first_seconds))
+    if found.expected is None:
+        say(out, f"\n{found.certificate}")
+    for line in written:
+        out.print(line, markup=False, soft_wrap=True)
+    if not found.status.ok:
+        output.wrong([text.ended(found)])
+    output.data(text.as_data(found))
 
 
 def _draw(found: Any, path: Path) -> None:

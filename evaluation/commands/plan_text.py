@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import dataclasses
 from typing import Any
 
-from rich import box
-from rich.table import Table
-from rich.text import Text
-
-#: Header and the cell of a row.
-Column = tuple[str, Callable[[Any], str]]
+from slipcar.evaluation.report.layout import Fitted
+from slipcar.evaluation.report.table import Field, table_of_records
 
 
 def summary(found: Any, first_seconds: float) -> str:
@@ -20,8 +16,7 @@ def summary(found: Any, first_seconds: float) -> str:
         found: a plan.
         first_seconds: what the same plan took in a process that had made none.
     """
-    meaning = found.status.value.partition(": ")[2] or found.status.value
-    lines = [f"{found.status}: {meaning}"]
+    lines = [ended(found)]
     if found.message:
         lines.append(f"  {found.message}")
     lines.append(
@@ -51,6 +46,28 @@ def summary(found: Any, first_seconds: float) -> str:
     return "\n".join(lines)
 
 
+def ended(found: Any) -> str:
+    """How planning ended, in a sentence."""
+    meaning = found.status.value.partition(": ")[2] or found.status.value
+    return f"{found.status}: {meaning}"
+
+
+def as_data(found: Any) -> dict[str, Any]:
+    """The plan as plain data, for JSON: what came out, what it proves, and the trajectory."""
+    numbers = ("effort", "obstacle_cost", "running_cost", "cost", "variance", "iterations")
+    arrays = ("times", "mean", "controls", "covariance", "gains")
+    return {
+        "status": found.status.name,
+        "message": found.message,
+        **{name: getattr(found, name) for name in (*numbers, "solve_time", "final_time")},
+        "expected": None if found.expected is None else dataclasses.asdict(found.expected),
+        "risk": None if found.risk is None else dataclasses.asdict(found.risk),
+        "residuals": None if found.expected is not None else found.certificate.residuals,
+        "options": found.options,
+        **{name: getattr(found, name) for name in arrays},
+    }
+
+
 def _expected(cost: Any) -> str:
     """One line on an expected cost."""
     goal = f", goal {cost.goal:.4f}" if cost.goal else ""
@@ -61,59 +78,46 @@ def _expected(cost: Any) -> str:
     )
 
 
-def iterations_table(found: Any) -> Table:
+def iterations_table(found: Any) -> Fitted:
     """One line an iteration."""
-    columns: tuple[Column, ...] = (
-        ("effort", lambda i: f"{i.effort:.6f}"),
-        ("obstacle", lambda i: f"{i.penalty:.6f}"),
-        ("∫ tr Σ dt", lambda i: f"{i.variance:.6f}" if i.variance == i.variance else "–"),
-        ("∫‖Δu‖² dt", lambda i: f"{i.step:.2e}"),
-        ("∫E‖Δx‖² dt", lambda i: f"{i.trust_radius:.2e}"),
-        ("virtual control", lambda i: f"{i.virtual_control:.1e}"),
-        ("|g(x(T))|", lambda i: f"{i.terminal_residual:.1e}"),
-        ("taken", lambda i: "yes" if i.accepted else "no"),
-        ("time [ms]", lambda i: _milliseconds(i.seconds)),
+    fields: tuple[Field, ...] = (
+        ("effort", lambda i: i.effort, ".6f"),
+        ("obstacle", lambda i: i.penalty, ".6f"),
+        ("∫ tr Σ dt", lambda i: i.variance, ".6f"),
+        ("∫‖Δu‖² dt", lambda i: i.step, ".2e"),
+        ("∫E‖Δx‖² dt", lambda i: i.trust_radius, ".2e"),
+        ("virtual control", lambda i: i.virtual_control, ".1e"),
+        ("|g(x(T))|", lambda i: i.terminal_residual, ".1e"),
+        ("taken", lambda i: "yes" if i.accepted else "no", ""),
+        ("time [ms]", lambda i: 1e3 * i.seconds, ".3f"),
     )
-    return _table("iteration", columns, found.history)
+    return Fitted(table_of_records("iteration", fields, found.history))
 
 
-def horizons_table(found: Any) -> Table:
+def horizons_table(found: Any) -> Fitted:
     """One line a final time tried."""
-    columns: tuple[Column, ...] = (
-        ("final time T [s]", lambda s: f"{s.final_time:.6f}"),
-        ("cost + weight · T", lambda s: f"{s.objective:.6f}"),
-        ("slope (transversality)", lambda s: f"{s.slope:+.1e}"),
-        ("trusted ± [s]", lambda s: f"{s.radius:.2g}"),
-        ("iterations", lambda s: str(s.iterations)),
-        ("taken", lambda s: "yes" if s.accepted else "no"),
+    fields: tuple[Field, ...] = (
+        ("final time T [s]", lambda s: s.final_time, ".6f"),
+        ("cost + weight · T", lambda s: s.objective, ".6f"),
+        ("slope (transversality)", lambda s: s.slope, "+.1e"),
+        ("trusted ± [s]", lambda s: s.radius, ".2g"),
+        ("iterations", lambda s: s.iterations, "d"),
+        ("taken", lambda s: "yes" if s.accepted else "no", ""),
     )
-    return _table("horizon", columns, found.time_search)
+    return Fitted(table_of_records("horizon", fields, found.time_search))
 
 
-def alternatives_table(found: Any) -> Table:
+def alternatives_table(found: Any) -> Fitted:
     """One line a guess, the best first."""
-    columns: tuple[Column, ...] = (
-        ("guess", lambda a: a.label),
-        ("status", lambda a: str(a.status)),
-        ("cost", lambda a: f"{a.cost:.6f}"),
-        ("way round", lambda a: "–" if a.homotopy is None else str(a.homotopy)),
-        ("iterations", lambda a: str(a.iterations)),
-        ("same as", lambda a: a.same_as or ""),
+    fields: tuple[Field, ...] = (
+        ("guess", lambda a: a.label, ""),
+        ("status", lambda a: a.status, ""),
+        ("cost", lambda a: a.cost, ".6f"),
+        ("way round", lambda a: "–" if a.homotopy is None else a.homotopy, ""),
+        ("iterations", lambda a: a.iterations, "d"),
+        ("same as", lambda a: a.same_as or "", ""),
     )
-    return _table("place", columns, found.alternatives, left=("guess", "status", "same as"))
-
-
-def _table(
-    number: str, columns: Iterable[Column], rows: Iterable[Any], left: Iterable[str] = ()
-) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column(number, justify="right")
-    columns, left = tuple(columns), tuple(left)
-    for header, _ in columns:
-        table.add_column(Text(header), justify="left" if header in left else "right")
-    for place, row in enumerate(rows, start=1):
-        table.add_row(str(place), *(Text(cell(row)) for _, cell in columns))
-    return table
+    return Fitted(table_of_records("place", fields, found.alternatives))
 
 
 def _milliseconds(seconds: float) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from slipcar.evaluation.commands.inputs import console
+from slipcar.evaluation.commands.checks import check_figures, check_file, check_folder
+from slipcar.evaluation.commands.output import Output, OutputOption, finish
 from slipcar.evaluation.reproduction.reproduce import EPISODES
 
 
@@ -17,6 +18,7 @@ def reproduce(
     workers: int = 1,
     figures: bool = True,
     docs: Path | None = None,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Check every claim of the paper's section 6, and show by numbers where its text is wrong.
 
@@ -41,22 +43,28 @@ def reproduce(
         figures: draw the figures as well (needs matplotlib).
         docs: also write the page of the documentation, with its figures beside it, to this .md
             file.
+        output: what is printed.
     """
     from rich import progress
     from rich.console import Console
 
     from slipcar.evaluation.reproduction.reproduce import reproduce as compute
 
-    out = console()
     columns = (
         progress.BarColumn(), progress.TaskProgressColumn(), progress.TimeElapsedColumn(),
+        progress.TextColumn("left"), progress.TimeRemainingColumn(),
         progress.TextColumn("{task.description}"),
     )  # fmt: skip
     if docs is not None and docs.suffix != ".md":
         raise ValueError(f"--docs must name a .md file, not {str(docs)!r}")
     if docs is not None and not figures:
         raise ValueError("--docs shows the figures: leave --no-figures out")
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    check_file(docs)
+    check_folder(folder)
+    check_figures(figures, "--no-figures")
+    with progress.Progress(
+        *columns, console=Console(stderr=True), transient=True, disable=output.quiet
+    ) as bar:
         task = bar.add_task("", total=1.0)
         done = compute(
             episodes,
@@ -65,14 +73,17 @@ def reproduce(
             n_jobs=workers,
             progress=lambda what, share: bar.update(task, completed=share, description=what),
         )
-    out.print(done.document(figures=False).terminal())
-    with out.status("writing tables and drawing figures ..."):
+    shown = done.document(figures=False)
+
+    def save() -> list[Path]:
         written = done.save(folder, figures=figures)
         if docs is not None:
             from slipcar.evaluation.reproduction import page as reproduce_page
 
             written += reproduce_page.save(done, docs, folder)
-    out.print(f"{len(written)} files:", markup=False)
-    for path in written:
-        out.print(f"  {path}", markup=False, soft_wrap=True)
+        return written
+
+    finish(output, save, shown.terminal)
+    if output.json:
+        print(shown.to_json(), end="")
     return 0

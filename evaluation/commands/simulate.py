@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -10,23 +9,34 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from slipcar.evaluation.commands.checks import (
+    FIGURES,
+    check_display,
+    check_figures,
+    check_file,
+    check_folder,
+)
 from slipcar.evaluation.commands.inputs import (
     CONTROLLER_HELP,
     OwnScenarioOption,
-    console,
     read_controller,
     read_scenario,
 )
+from slipcar.evaluation.commands.output import Output, OutputOption
+from slipcar.evaluation.report.layout import Fitted
+from slipcar.evaluation.report.table import Field, table_of_records
 
 if TYPE_CHECKING:
     import numpy as np
-    from rich.table import Table
 
-    from slipcar.evaluation.metrics import EpisodeMetrics
+    from slipcar.envs.scenario import Scenario
+    from slipcar.evaluation.metrics import EpisodeMetrics, Result
     from slipcar.evaluation.recording import Recording
 
 _DEFAULT = "feedback"
 _MOST_FILMED = 50
+_MOST_LISTED = 20
+_COSTS = ("total", "effort", "obstacle", "goal")
 _LONG = 100  # pictures; more get a progress bar
 
 
@@ -55,6 +65,7 @@ def simulate(
     human: bool = False,
     tiled: bool = False,
     overlay: bool = True,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Drive a few episodes and print each; draw them, film them, or watch them.
 
@@ -80,17 +91,17 @@ def simulate(
         trust: load a Stable-Baselines3 model, which runs whatever code is in the file.
         figure: draw all paths to this .png, .pdf or .svg (needs matplotlib).
         video: film the episodes, H.264 in an .mp4 (needs pygame and imageio-ffmpeg:
-            slipcar[plot,video]).
+            the extras plot and video).
         gif: film the episodes, one picture at each node (needs pygame and pillow).
         frames: write every picture of the GIF as a PNG into this folder.
         human: play them in a window (needs pygame and a display).
         tiled: film the episodes side by side rather than one after the other.
         overlay: draw what the controller means to do, where it has a plan: the path, and the
             region the car is in with probability 95 %.
+        output: what is printed.
     """
     from slipcar.evaluation import evaluate, sample_paths
 
-    out = console()
     if driver is not None and controller is not None and driver != controller:
         raise ValueError(f"who drives, {driver!r} or --controller {controller!r}?")
     named = driver or controller or _DEFAULT
@@ -100,57 +111,74 @@ def simulate(
     _check_files(figure, video, gif, frames)
     if filmed:
         _check_pictures(episodes, video is not None)
+    if human:
+        check_display()
     world = None if scenario is None else read_scenario(scenario)
     drives, world = read_controller(named, world, trust)
     result = evaluate(drives, world, episodes, seed)
-    out.print(episodes_table(result.metrics))
+    written: list[str] = []
+    try:
+        if figure is not None:
+            states, _ = sample_paths(drives, world, episodes, seed)
+            _draw(world, states, f"{named}, seed {seed}", figure)
+            written.append(f"figure in {figure}")
+        if filmed:
+            from slipcar.evaluation.recording import record
+
+            recording = record(drives, world, episodes, seed, overlay=overlay)
+            quiet = output.quiet or not sys.stderr.isatty()
+            written += _film(recording, video, gif, frames, tiled, quiet)
+    finally:
+        _print(output, result, written)
+    if human:
+        from slipcar.evaluation import film
+
+        film.show(recording, tiled=tiled)
+    return 0
+
+
+def _print(output: Output, result: Result, written: list[str]) -> None:
+    out, metrics = output.console(), result.metrics
+    out.print(episodes_table(metrics))
+    if len(metrics) > _MOST_LISTED:
+        out.print(f"and {len(metrics) - _MOST_LISTED} more")
+    out.print()
     out.print(
-        f"{result.metrics.collision.sum()} of {episodes} episodes collide; mean cost "
+        f"{metrics.collision.sum()} of {len(metrics)} episodes collide; mean cost "
         f"{result.total:.3f}",
         markup=False,
     )
-    if figure is not None:
-        from slipcar.evaluation.figures import saved as plots
+    for line in written:
+        out.print(line, markup=False, soft_wrap=True)
+    episodes = metrics.to_dict() | {"total": metrics.total}
+    output.data({"summary": result.summary(), "episodes": episodes})
 
-        states, _ = sample_paths(drives, world, episodes, seed)
-        drawn = plots.paths_figure(world, states, f"{named}, seed {seed}")
-        figure.parent.mkdir(parents=True, exist_ok=True)
-        with plots.style():
-            drawn.savefig(figure, dpi=150)
-        out.print(f"figure in {figure}", markup=False)
-    if filmed:
-        from slipcar.evaluation.recording import record
 
-        recording = record(drives, world, episodes, seed, overlay=overlay)
-        for line in _film(recording, video, gif, frames, human, tiled):
-            out.print(line, markup=False)
-    return 0
+def _draw(world: Scenario, states: np.ndarray, title: str, path: Path) -> None:
+    from slipcar.evaluation.figures import saved as plots
+
+    drawn = plots.paths_figure(world, states, title)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with plots.style():
+        drawn.savefig(path, dpi=150)
 
 
 def _check_files(
     figure: Path | None, video: Path | None, gif: Path | None, frames: Path | None
 ) -> None:
-    """Complain of names and folders before the work, not after it."""
+    """Complain of names, folders and packages before the work, not after it."""
     from slipcar.evaluation.film import check_suffix
 
-    if figure is not None and figure.suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"a figure's name ends in .png, .pdf or .svg, not {figure.name!r}")
+    check_file(figure, FIGURES, "a figure")
     if gif is not None:
         check_suffix(gif, ".gif", "a GIF")
     if video is not None:
         check_suffix(video, ".mp4", "a film")
-    for path in (figure, video, gif, frames):
-        if path is None:
-            continue
-        folder = path if path is frames else path.parent
-        if path is not frames and path.is_dir():
-            raise ValueError(f"{path} is a folder, not a file to write")
-        while not folder.exists() and folder != folder.parent:  # what is missing will be made
-            folder = folder.parent
-        if not folder.is_dir():
-            raise ValueError(f"cannot write {path}: {folder} is no folder")
-        if not os.access(folder, os.W_OK):
-            raise ValueError(f"cannot write {path}: no permission to write to {folder}")
+    for path in (video, gif):
+        check_file(path)
+    if frames is not None:
+        check_folder(frames)
+    check_figures(figure is not None)
 
 
 def _check_pictures(episodes: int, video: bool) -> None:
@@ -174,16 +202,15 @@ def _film(
     video: Path | None,
     gif: Path | None,
     frames: Path | None,
-    human: bool,
     tiled: bool,
+    quiet: bool,
 ) -> Iterator[str]:
-    from gymnasium.error import Error
-
     from slipcar.evaluation import film
 
     def pictures(fps: int | None) -> Iterable[np.ndarray]:
         count = film.length(recording, fps=fps, tiled=tiled)
-        return _with_bar(film.frames(recording, fps=fps, tiled=tiled), count)
+        shown = film.frames(recording, fps=fps, tiled=tiled)
+        return shown if quiet or count <= _LONG else _with_bar(shown, count)
 
     if video is not None:
         yield f"film in {film.save_video(video, pictures(film.FPS))}"
@@ -192,47 +219,23 @@ def _film(
         yield f"film in {film.save_gif(gif, pictures(None), rate)}"
     if frames is not None:
         yield f"{len(film.save_frames(frames, pictures(None)))} frames in {frames}"
-    if human:
-        try:
-            film.show(recording, tiled=tiled)
-        except Error as error:  # Gymnasium's own: there is no display
-            raise ValueError(str(error)) from error
 
 
 def _with_bar(pictures: Iterable[np.ndarray], count: int) -> Iterable[np.ndarray]:
-    """The pictures themselves, behind a progress bar if they are many and someone is watching."""
+    """The pictures themselves, behind a progress bar."""
     from rich.console import Console
     from rich.progress import track
 
-    quiet = count <= _LONG or not sys.stderr.isatty()
-    console = Console(stderr=True)
-    return track(pictures, "filming", total=count, console=console, transient=True, disable=quiet)
+    return track(pictures, "filming", total=count, console=Console(stderr=True), transient=True)
 
 
-def episodes_table(metrics: EpisodeMetrics, most: int = 20) -> Table:
+def episodes_table(metrics: EpisodeMetrics, most: int = _MOST_LISTED) -> Fitted:
     """One line an episode, the first `most` of them."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    headers = (
-        "episode", "total", "effort", "obstacle", "goal", "collision", "clearance [m]",
-        "position error [m]",
-    )  # fmt: skip
-    for header in headers:
-        table.add_column(Text(header), justify="right")
-    for i in range(min(most, len(metrics))):
-        table.add_row(
-            str(i),
-            *(
-                f"{getattr(metrics, name)[i]:.3f}"
-                for name in ("total", "effort", "obstacle", "goal")
-            ),
-            "yes" if metrics.collision[i] else "no",
-            f"{metrics.clearance[i]:.3f}",
-            f"{metrics.position_error[i]:.3f}",
-        )
-    if len(metrics) > most:
-        table.caption = f"and {len(metrics) - most} more"
-    return table
+    fields: tuple[Field, ...] = (
+        *((name, lambda i, name=name: getattr(metrics, name)[i], ".3f") for name in _COSTS),
+        ("collision", lambda i: "yes" if metrics.collision[i] else "no", ""),
+        ("clearance [m]", lambda i: metrics.clearance[i], ".3f"),
+        ("position error [m]", lambda i: metrics.position_error[i], ".3f"),
+    )
+    episodes = range(min(most, len(metrics)))
+    return Fitted(table_of_records("episode", fields, episodes, first=0))

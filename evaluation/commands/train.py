@@ -14,7 +14,9 @@ import tyro
 from slipcar.baselines import CloneConfig, PathwiseConfig, Policy, PPOConfig, load_policy
 from slipcar.envs.families import Family
 from slipcar.envs.sources import Source
-from slipcar.evaluation.commands.inputs import console, read_scenario
+from slipcar.evaluation.commands.checks import check_folder
+from slipcar.evaluation.commands.inputs import read_scenario
+from slipcar.evaluation.commands.output import Output, OutputOption, say
 
 #: Fresh episodes that a policy is judged by when it is done, and their first seed.
 _EPISODES, _SEED = 10_000, 0
@@ -69,6 +71,7 @@ def train(
     config: Annotated[PPOOptions, tyro.conf.arg(name="")] = PPOOptions(),  # noqa: B008  frozen
     pathwise: PathwiseOptions = PathwiseOptions(),  # noqa: B008
     cloning: CloneOptions = CloneOptions(),  # noqa: B008
+    output: OutputOption = Output(),  # noqa: B008
 ) -> int:
     """Train a policy, by default with PPO, which never sees a plan.
 
@@ -102,22 +105,33 @@ def train(
         config: how to train with PPO.
         pathwise: how to train by pathwise gradients.
         cloning: how to imitate the planner.
+        output: what is printed.
     """
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, not {seeds}")
     source = _read_source(scenario)
     options = {"": _given(config), "pathwise.": _given(pathwise), "cloning.": _given(cloning)}
-    learn = _learner(method, source, options, None if initial is None else load_policy(initial))
+    start = None if initial is None else load_policy(initial)
+    learn = _learner(method, source, options, start, not output.quiet)
     place = Path("runs") / method if folder is None else folder
+    check_folder(place)
+    trained = []
     for number in range(seed, seed + seeds):
         here = place if seeds == 1 else place / f"seed-{number}"
         policy = learn(number, here, resume)
-        console().print(f"{_judged(policy)}\npolicy in {here}", markup=False)
+        score = _score(policy)
+        say(output.console(), f"{_judged(score)}\npolicy in {here}")
+        trained.append({"seed": number, "folder": str(here), **score})
+    output.data(trained)
     return 0
 
 
 def _learner(
-    method: str, source: Source, options: dict[str, dict[str, Any]], initial: Policy | None
+    method: str,
+    source: Source,
+    options: dict[str, dict[str, Any]],
+    initial: Policy | None,
+    progress: bool,
 ) -> Callable[[int, Path, bool], Policy]:
     """What trains with a seed into a folder, going on there or not.
 
@@ -126,6 +140,7 @@ def _learner(
         source: what to learn.
         options: those that were given, by prefix.
         initial: what to start from, or None.
+        progress: whether to show a bar.
 
     Raises:
         ValueError: for a bad option, or one of another method.
@@ -147,7 +162,7 @@ def _learner(
     if method == "pathwise":
         steps = dataclasses.replace(PathwiseConfig.suited_to(source), **pathwise)
         return lambda seed, folder, _: baselines.train_pathwise(
-            source, steps, seed=seed, folder=folder, initial=initial
+            source, steps, seed=seed, folder=folder, initial=initial, progress=progress
         )
     copying = dataclasses.replace(CloneConfig.suited_to(source), **cloning)
     if method == "cloned":
@@ -157,11 +172,11 @@ def _learner(
     if method == "warm-started":
         on = dataclasses.replace(finetuning(source), **ppo)
         return lambda seed, folder, resume: baselines.train_warm_started(
-            source, on, cloning=copying, seed=seed, folder=folder, resume=resume
+            source, on, cloning=copying, seed=seed, folder=folder, resume=resume, progress=progress
         )
     how = dataclasses.replace(PPOConfig.suited_to(source), **ppo)
     return lambda seed, folder, resume: baselines.train_ppo(
-        source, how, seed=seed, folder=folder, resume=resume, initial=initial
+        source, how, seed=seed, folder=folder, resume=resume, initial=initial, progress=progress
     )
 
 
@@ -179,22 +194,29 @@ def _read_source(text: str) -> Source:
     return read_scenario(text)
 
 
-def _judged(policy: Policy) -> str:
+def _score(policy: Policy) -> dict[str, Any]:
     """What it reaches on episodes, and of a family in worlds, that it has not met."""
     if isinstance(policy.trained_on, Family):
         from slipcar.baselines import score
 
         found = score(policy, policy.trained_on.held_out(), _EPISODES, _SEED)
-        return (
-            f"{found.episodes:,} episodes in 100 held-out worlds: cost {found.total:.3f}, "
-            f"collisions {found.collision_rate:.2%}, position RMS {found.position_rms:.3f} m"
-        )
+        names = ("episodes", "total", "collision_rate", "position_rms")
+        return {"held_out_worlds": 100, **{name: getattr(found, name) for name in names}}
     from slipcar.evaluation import evaluate
 
-    result = evaluate(policy, policy.trained_on, _EPISODES, _SEED)
-    low, high = result.collision_interval
+    return evaluate(policy, policy.trained_on, _EPISODES, _SEED).summary()
+
+
+def _judged(score: dict[str, Any]) -> str:
+    """The same as a line."""
+    rate, rms = score["collision_rate"], score["position_rms"]
+    if "held_out_worlds" in score:
+        return (
+            f"{score['episodes']:,} episodes in {score['held_out_worlds']} held-out worlds: cost "
+            f"{score['total']:.3f}, collisions {rate:.2%}, position RMS {rms:.3f} m"
+        )
     return (
-        f"{result.episodes:,} fresh episodes: cost {result.total:.3f} ± {result.total_se:.3f}, "
-        f"collisions {result.collision_rate:.2%} [{low:.2%}, {high:.2%}], position RMS "
-        f"{result.position_rms:.3f} m"
+        f"{score['episodes']:,} fresh episodes: cost {score['total']:.3f} ± "
+        f"{score['total_se']:.3f}, collisions {rate:.2%} [{score['collision_low']:.2%}, "
+        f"{score['collision_high']:.2%}], position RMS {rms:.3f} m"
     )

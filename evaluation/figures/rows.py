@@ -12,6 +12,7 @@ from slipcar.evaluation.figures.scene import PALETTE, PAPER, new_figure, style
 from slipcar.evaluation.statistics import CONFIDENCE
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from slipcar.evaluation.metrics import Result
@@ -57,47 +58,7 @@ def tradeoff_figure(comparison: ComparisonRecord) -> Figure:
     with style():
         figure = new_figure(8.8, 4.3)
         axes = figure.subplots()
-        for name, look in _looks(comparison).items():
-            result = comparison.results[name]
-            rate, at = result.collision_rate, 100.0 * result.collision_rate
-            low, high = (100.0 * end for end in result.collision_interval)
-            label, marker = look["label"], look["marker"]
-            if rate == 0.0:
-                # Nothing observed has no place on a logarithmic axis: it is shown at the
-                # interval's upper end, pointing left.
-                at = low = high
-                marker, label = "<", f"{label}: none observed"
-            if not look["drawn"]:
-                label, marker, at = _off_axes_label(look["label"], result), look["marker"], np.nan
-            axes.plot(
-                at,
-                result.total if look["drawn"] else np.nan,
-                marker=marker,
-                color=look["colour"],
-                markerfacecolor=look["face"],
-                markeredgewidth=1.5,
-                markersize=7.5,
-                linestyle="none",
-                zorder=4,
-                label=label,
-            )
-            if look["drawn"]:
-                axes.errorbar(
-                    at,
-                    result.total,
-                    xerr=[[max(at - low, 0.0)], [max(high - at, 0.0)]],
-                    yerr=1.96 * np.nan_to_num(result.total_se),
-                    color=look["colour"],
-                    fmt="none",
-                    capsize=3.0,
-                    elinewidth=1.2,
-                    zorder=3,
-                )
-        axes.set_xscale("log")
-        axes.margins(0.12)
-        _plain_log_ticks(axes.xaxis)
-        axes.set_xlabel(f"collision rate [%], {CONFIDENCE:.0%} interval")
-        axes.set_ylabel(f"mean cost of a path, {CONFIDENCE:.0%} interval")
+        draw_tradeoff(axes, comparison)
         figure.legend(
             *axes.get_legend_handles_labels(),
             loc="outside right upper",
@@ -105,6 +66,51 @@ def tradeoff_figure(comparison: ComparisonRecord) -> Figure:
             alignment="left",
         )
     return figure
+
+
+def draw_tradeoff(axes: Axes, comparison: ComparisonRecord) -> None:
+    """Draw it into axes; the legend is the caller's."""
+    for name, look in _looks(comparison).items():
+        result = comparison.results[name]
+        rate, at = result.collision_rate, 100.0 * result.collision_rate
+        low, high = (100.0 * end for end in result.collision_interval)
+        label, marker = look["label"], look["marker"]
+        if rate == 0.0:
+            # Nothing observed has no place on a logarithmic axis: it is shown at the
+            # interval's upper end, pointing left.
+            at = low = high
+            marker, label = "<", f"{label}: none observed"
+        if not look["drawn"]:
+            label, marker, at = _off_axes_label(look["label"], result), look["marker"], np.nan
+        axes.plot(
+            at,
+            result.total if look["drawn"] else np.nan,
+            marker=marker,
+            color=look["colour"],
+            markerfacecolor=look["face"],
+            markeredgewidth=1.5,
+            markersize=7.5,
+            linestyle="none",
+            zorder=4,
+            label=label,
+        )
+        if look["drawn"]:
+            axes.errorbar(
+                at,
+                result.total,
+                xerr=[[max(at - low, 0.0)], [max(high - at, 0.0)]],
+                yerr=1.96 * np.nan_to_num(result.total_se),
+                color=look["colour"],
+                fmt="none",
+                capsize=3.0,
+                elinewidth=1.2,
+                zorder=3,
+            )
+    axes.set_xscale("log")
+    axes.margins(0.12)
+    _plain_log_ticks(axes.xaxis)
+    axes.set_xlabel(f"collision rate [%], {CONFIDENCE:.0%} interval")
+    axes.set_ylabel(f"mean cost of a path, {CONFIDENCE:.0%} interval")
 
 
 def _plain_log_ticks(axis: Any) -> None:

@@ -13,18 +13,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from slipcar.baselines.files import write_atomically
+from slipcar.envs.drawing import GREY, INK, PALETTE, PAPER
 from slipcar.envs.scenario import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-#: Okabe and Ito's palette: told apart by colour-blind readers too.
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F3C8D", "#000000")
-INK, GREY, PAPER = "#222222", "#8A8A8A", "#FFFFFF"
-OBSTACLE = "#C9CDD3"
 
 _STYLE: Any = {
     "font.size": 9.0,
@@ -90,45 +85,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 def draw_scene(axes: Axes, scenario: Scenario) -> None:
     """Obstacles with their clearance rings, start and goal, axes in metres."""
-    for i, (x, y, radius) in enumerate(scenario.obstacles):
-        axes.add_patch(
-            Circle(
-                (x, y),
-                radius,
-                facecolor=OBSTACLE,
-                edgecolor=GREY,
-                linewidth=0.8,
-                zorder=2,
-                label="obstacle" if i == 0 else None,
-            )
-        )
-        axes.add_patch(
-            Circle(
-                (x, y),
-                radius + scenario.clearance,
-                fill=False,
-                edgecolor=GREY,
-                linewidth=0.7,
-                linestyle=(0, (4, 3)),
-                zorder=2,
-                label="clearance" if i == 0 else None,
-            )
-        )
-    for state, marker, label in ((scenario.start, "o", "start"), (scenario.goal, "*", "goal")):
-        axes.plot(
-            *state[:2],
-            marker=marker,
-            markersize=7 if marker == "o" else 13,
-            markerfacecolor=PAPER if marker == "o" else PALETTE[4],
-            markeredgecolor=INK,
-            markeredgewidth=0.9,
-            linestyle="none",
-            zorder=8,
-            label=label,
-        )
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("$r_x$ [m]")
-    axes.set_ylabel("$r_y$ [m]")
+    scenario.draw(axes)
 
 
 def draw_paths(axes: Axes, states: np.ndarray, **line: Any) -> LineCollection:

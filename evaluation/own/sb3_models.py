@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.envs.extras import install
 from slipcar.evaluation.controller import observation_layout
 from slipcar.evaluation.own.as_controller import check_spaces
 
@@ -90,7 +91,7 @@ def load_model(path: str | Path, *, trust: bool = False) -> StoredModel:
     except ImportError as error:
         raise ImportError(
             f"{path} is a {algorithm} model, which needs {package} ({error}): "
-            f"pip install 'slipcar[rl]'" + (" sb3-contrib" if package == "sb3_contrib" else "")
+            f"{install('rl')}" + (" sb3-contrib" if package == "sb3_contrib" else "")
         ) from error
     try:
         model = _loaded(cls, path)

@@ -6,13 +6,18 @@ import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
+from html import escape
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from slipcar.envs.extras import install
 from slipcar.evaluation import learning
 from slipcar.evaluation.cells import controller_fingerprint
 from slipcar.evaluation.comparison_record import ComparisonRecord
+from slipcar.evaluation.report import text as report_text
 from slipcar.evaluation.report.document import Document, Figure, plain, write_texts
 from slipcar.evaluation.report.formats import (
     collisions,
@@ -23,26 +28,26 @@ from slipcar.evaluation.report.formats import (
 )
 from slipcar.evaluation.report.table import Column, Table, table_of
 from slipcar.evaluation.runs import Runs
+from slipcar.evaluation.statistics import Interval, leader, student_interval
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
 
 LOOP = Column("loop", lambda row: "closed" if row["closed_loop"] else "open")
-TOTAL = Column("total cost", with_error("total"), "total")
-COLLISIONS = Column("collisions [%]", collisions(2), "collision_rate")
+TOTAL = Column("total cost", with_error("total"), "total", "total_best")
+COLLISIONS = Column("collisions [%]", collisions(2), "collision_rate", "collision_best")
 _PARTS = ("effort", "obstacle", "goal")
 COST = (LOOP, TOTAL, *(Column(part, with_error(part), value=part) for part in _PARTS), COLLISIONS)
 #: The same for a terminal, where columns are dear.
 COST_BRIEF = (
-    *(LOOP, TOTAL),
+    *(LOOP, TOTAL, COLLISIONS),
     *(Column(part, number(part, 3), value=part) for part in _PARTS),
-    COLLISIONS,
 )
 BETWEEN = (
     LOOP,
-    Column("at nodes [%]", collisions(2), "collision_rate"),
-    Column("at or between nodes [%]", collisions(2, "between"), "between_rate"),
+    Column("at nodes [%]", collisions(2), "collision_rate", "collision_best"),
+    Column("at or between nodes [%]", collisions(2, "between"), "between_rate", "touched_best"),
 )
 DIFFERENCE = (
     LOOP,
@@ -64,13 +69,13 @@ TAILS = (
         Column(f"cost {quantile} %", number(f"total_p{quantile}", 3), f"total_p{quantile}")
         for quantile in (50, 95, 99)
     ),
-    Column("dearest 5 %", with_error("total_cvar95"), "total_cvar95"),
+    Column("dearest 5 %", with_error("total_cvar95"), "total_cvar95", "tail_best"),
     *(
-        Column(f"clearance {int(quantile)} % [m]", number(key, 3), key, -1)
+        Column(f"clearance {int(quantile)} % [m]", number(key, 3), key)
         for quantile in ("50", "05", "01")
         for key in (f"clearance_p{quantile}",)
     ),
-    Column("closest 5 % [m]", number("clearance_cvar05", 3), "clearance_cvar05", -1),
+    Column("closest 5 % [m]", number("clearance_cvar05", 3), "clearance_cvar05"),
 )
 ACCURACY = (
     LOOP,
@@ -102,8 +107,66 @@ FIGURES = {
 }
 
 
+def _winners(comparison: ComparisonRecord) -> dict[str, list[bool]]:
+    """Which cells are emphasised: by column that says so, of each row."""
+    tails = {name: result.cost_cvar for name, result in comparison.results.items()}
+
+    def apart(name: str, best: str) -> Interval:
+        (value, error), (other, its) = tails[name], tails[best]
+        return student_interval(value - other, float(np.hypot(error, its)), float("inf"))
+
+    leaders = {
+        **{f"{metric}_best": first for metric, first in comparison.leaders.items()},
+        "tail_best": leader({name: value for name, (value, _) in tails.items()}, apart),
+    }
+    return {
+        key: [found is not None and name == found.winner for name in comparison.controllers]
+        for key, found in leaders.items()
+    }
+
+
+def sentences(comparison: ComparisonRecord) -> list[str]:
+    """What the main table says, in three sentences: no more than its intervals allow.
+
+    The cheapest row, the safest one, and how many differ from the reference; not told apart are
+    rows whose paired difference has an interval that includes zero.
+    """
+    found = []
+    for metric, what, text in (
+        ("total", "Cheapest", with_error("total")),
+        ("collision", "Fewest collisions", collisions(2)),
+    ):
+        first = comparison.leaders[metric]
+        if first is None:
+            continue
+        unit = " %" if metric == "collision" else ""
+        said = f"{what}: “{first.name}”, {text(comparison.frame.loc[first.name])}{unit}"
+        others = len(comparison.results) - 1 - len(first.tied)
+        if not first.tied:
+            said += "; every other row has more (95 % intervals of paired differences)"
+        elif others:
+            said += f"; not told apart from it: {', '.join(f'“{name}”' for name in first.tied)}"
+        else:
+            said += "; no other row can be told apart from it"
+        found.append(f"{said}.")
+    frame, reference = comparison.frame, comparison.reference
+    rows = [name for name in comparison.results if name != reference]
+    if reference in comparison.results and rows:
+        low, high = frame["total_difference_low"][rows], frame["total_difference_high"][rows]
+        cheaper, dearer = int((high < 0.0).sum()), int((low > 0.0).sum())
+        found.append(
+            f"Against “{reference}” on the same paths: of {len(rows)} other rows {cheaper} "
+            f"cheaper, {dearer} dearer, {len(rows) - cheaper - dearer} not told apart "
+            "(95 % intervals)."
+        )
+    return found
+
+
 def tables(comparison: ComparisonRecord, brief: bool = False) -> tuple[Table, ...]:
-    """The printed tables, in order."""
+    """The printed tables, in order.
+
+    A row is emphasised where its difference to each other has a 95 % interval that excludes zero.
+    """
     captioned: list[tuple[str, tuple[Column, ...]]] = [
         (
             "Cost of a path (mean ± standard error) and collisions (Wilson 95 % interval)",
@@ -127,7 +190,8 @@ def tables(comparison: ComparisonRecord, brief: bool = False) -> tuple[Table, ..
         ("Error at the goal", ACCURACY),
     ]
     frame = comparison.frame
-    done = [table_of(frame, caption, columns) for caption, columns in captioned]
+    marked = frame.assign(**_winners(comparison))
+    done = [table_of(marked, caption, columns) for caption, columns in captioned]
     trainings = training_frame(frame, comparison)
     if len(trainings):
         caption = (
@@ -249,9 +313,17 @@ def latex(comparison: ComparisonRecord) -> str:
     return document(comparison).latex()
 
 
-def terminal(comparison: ComparisonRecord) -> Group:
-    """Tables for a terminal, to be printed by a rich console."""
-    return document(comparison, brief=True).terminal()
+def terminal(comparison: ComparisonRecord, all_tables: bool = True) -> Group:
+    """For a terminal, to be printed by a rich console: the main table and what it says, or all."""
+    shown = document(comparison, brief=True)
+    return shown.terminal() if all_tables else shown.terminal(1, sentences(comparison))
+
+
+def html(comparison: ComparisonRecord) -> str:
+    """The main table and what it says, for a notebook."""
+    table, *_ = tables(comparison, brief=True)
+    said = (setting(comparison), *sentences(comparison), *messages(comparison))
+    return report_text.html_table(table) + "".join(f"<p>{escape(text)}</p>" for text in said)
 
 
 def json_text(comparison: ComparisonRecord, frame: pd.DataFrame | None = None) -> str:
@@ -352,6 +424,6 @@ def tables_are_in(folder: Path) -> Iterator[None]:
         yield
     except ImportError as error:
         raise ImportError(
-            f"figures need matplotlib ({error}): pip install 'slipcar[plot]', or do without "
+            f"figures need matplotlib ({error}): {install('plot')}, or do without "
             f"(figures=False, --no-figures); the tables are in {folder}"
         ) from error

@@ -11,7 +11,7 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,9 +71,14 @@ class Document:
     provenance: Mapping[str, Any]
     scene: Mapping[str, Any] | None = None
 
-    def terminal(self) -> Group:
-        """For a terminal, to be printed by a rich console."""
-        return report_text.terminal(self)
+    def terminal(self, tables: int | None = None, sentences: Sequence[str] = ()) -> Group:
+        """For a terminal, to be printed by a rich console, which it fits.
+
+        Args:
+            tables: only the first so many; None prints all.
+            sentences: what the tables say, below them.
+        """
+        return report_text.terminal(self, tables, sentences)
 
     def markdown(self) -> str:
         """The setting, the tables, the notes and the provenance in Markdown."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from slipcar.baselines.files import write_atomically
+from slipcar.envs.extras import install
 from slipcar.evaluation.report import text as report_text
 from slipcar.evaluation.report.document import FILE, read_document
 from slipcar.evaluation.report.page import Section, html
@@ -22,7 +23,7 @@ KINDS = (
     "compare", "learning", "suite-random", "suite-slip", "suite-horizon", "frontier", "reproduce",
 )  # fmt: skip
 #: What is there without pyarrow.
-NO_PARQUET = "no Parquet files: they need pyarrow, pip install 'slipcar[report]'"
+NO_PARQUET = f"no Parquet files: they need pyarrow, {install('report')}"
 
 
 class Found(NamedTuple):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -64,54 +65,42 @@ class Column:
     Attributes:
         header: with its unit.
         text: from a row of the frame to what is printed.
-        best: the key whose smallest (`sign` 1) or largest (−1) value is emphasised, or None.
-        sign: see `best`.
+        value: the key of the number to sort by; None takes the text.
         marked: the key that says of each row whether it is emphasised, or None.
-        value: the key of the number to sort by; None takes `best`, and the text if that is None.
-        among: the key that says of each row whether it may be the best; None lets all.
     """
 
     header: str
     text: Callable[[Any], str]
-    best: str | None = None
-    sign: int = 1
-    marked: str | None = None
     value: str | None = None
-    among: str | None = None
+    marked: str | None = None
 
 
 def table_of(frame: pd.DataFrame, caption: str, columns: tuple[Column, ...]) -> Table:
     """A printed table of a frame: a row a row, its index first.
 
-    The best of a column, or those marked, are emphasised; rows that print the same as the best are
-    emphasised with it. A row whose `error` (if the frame has that column) is not empty prints
-    nothing else than its name, and where a number is nan there is none.
+    Those marked are emphasised: what is no winner beyond its interval should not be. A row whose
+    `error` (if the frame has that column) is not empty prints nothing else than its name, and
+    where a number is nan there is none.
     """
     rows = [row for _, row in frame.iterrows()]
     failed = [bool(row["error"]) if "error" in frame else False for row in rows]
     names = tuple(str(name) for name in frame.index)
-    texts, bold = [names], set()
-    numbers: list[tuple[float | None, ...]] = [(None,) * len(rows)]
+    texts: list[tuple[str, ...]] = [names]
+    bold: set[tuple[int, int]] = set()
+    sorted_by: list[tuple[float | None, ...]] = [(None,) * len(rows)]
     for j, column in enumerate(columns, start=1):
         printed = [
             NONE if fails else column.text(row) for fails, row in zip(failed, rows, strict=True)
         ]
-        key = column.value or column.best
+        key = column.value
         if key is not None:
             printed = [NONE if re.search(r"\bnan\b", text) else text for text in printed]
         there = [i for i, text in enumerate(printed) if text != NONE]
-        if column.best is not None:
-            rivals = [i for i in there if column.among is None or rows[i][column.among]]
-            rank = {i: column.sign * float(rows[i][column.best]) for i in rivals}
-            rank = {i: number for i, number in rank.items() if not math.isnan(number)}
-            if len(rank) > 1:
-                best = printed[min(rank, key=rank.__getitem__)]
-                bold |= {(i, j) for i in rank if printed[i] == best}
         if column.marked is not None:
             marks = list(frame[column.marked].eq(True))
             bold |= {(i, j) for i in there if marks[i]}
         texts.append(tuple(printed))
-        numbers.append(
+        sorted_by.append(
             tuple(
                 None if key is None or text == NONE else _finite(row[key])
                 for text, row in zip(printed, rows, strict=True)
@@ -121,7 +110,7 @@ def table_of(frame: pd.DataFrame, caption: str, columns: tuple[Column, ...]) -> 
         caption=caption,
         headers=(str(frame.index.name or "controller"), *(column.header for column in columns)),
         cells=tuple(zip(*texts, strict=True)),
-        values=tuple(zip(*numbers, strict=True)),
+        values=tuple(zip(*sorted_by, strict=True)),
         bold=frozenset(bold),
     )
 
@@ -129,3 +118,30 @@ def table_of(frame: pd.DataFrame, caption: str, columns: tuple[Column, ...]) -> 
 def _finite(value: Any) -> float | None:
     number = float(value)
     return number if math.isfinite(number) else None
+
+
+#: Of a record: its column's header, the record's value there, and how a number of it is printed.
+Field = tuple[str, Callable[[Any], Any], str]
+
+
+def table_of_records(
+    number: str, fields: Sequence[Field], records: Iterable[Any], first: int = 1
+) -> Table:
+    """A printed table of records, numbered from `first`: a row each, no caption.
+
+    Numbers are printed as their field says, nan as none; any other value as its text.
+    """
+    cells, values = [], []
+    for place, record in enumerate(records, start=first):
+        row: list[tuple[str, float | None]] = [(str(place), float(place))]
+        for _, value_of, form in fields:
+            value = value_of(record)
+            if isinstance(value, numbers.Real) and not isinstance(value, bool):
+                nan = math.isnan(value)
+                row.append((NONE, None) if nan else (format(value, form), _finite(value)))
+            else:
+                row.append((str(value), None))
+        cells.append(tuple(text for text, _ in row))
+        values.append(tuple(value for _, value in row))
+    headers = (number, *(header for header, *_ in fields))
+    return Table("", headers, tuple(cells), tuple(values))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any, Protocol
 
+from slipcar.evaluation.report.layout import Fitted, Prose
 from slipcar.evaluation.report.table import Table
 
 if TYPE_CHECKING:
@@ -158,33 +160,44 @@ def tex(text: str) -> str:
     return "".join(_TEX.get(letter, letter) for letter in text)
 
 
-def terminal(document: Printed) -> Group:
-    """Tables for a terminal, to be printed by a rich console."""
+def html_table(table: Table) -> str:
+    """A table in HTML, without script and with no style but its own; all of it is escaped."""
+    align = ["right" if table.numeric(j) else "left" for j in range(len(table.headers))]
+
+    def cell(i: int, j: int, text: str) -> str:
+        shown = f"<strong>{escape(text)}</strong>" if (i, j) in table.bold else escape(text)
+        kind = 'th scope="row"' if j == 0 else "td"
+        style = f'style="text-align:{align[j]};white-space:nowrap"'
+        return f"<{kind} {style}>{shown}</{kind[:2]}>"
+
+    head = "".join(
+        f'<th scope="col" style="text-align:{side}">{escape(header)}</th>'
+        for side, header in zip(align, table.headers, strict=True)
+    )
+    rows = "".join(
+        f"<tr>{''.join(cell(i, j, text) for j, text in enumerate(row))}</tr>"
+        for i, row in enumerate(table.cells)
+    )
+    return (
+        f'<table><caption style="text-align:left">{escape(table.caption)}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    )
+
+
+def terminal(document: Printed, tables: int | None = None, sentences: Sequence[str] = ()) -> Group:
+    """Tables for a terminal, to be printed by a rich console, which they fit.
+
+    Args:
+        document: what is printed.
+        tables: only the first so many; None prints all.
+        sentences: what the tables say, below them.
+    """
     from rich.console import Group
     from rich.text import Text
 
-    parts: list[Any] = [Text(document.setting), Text()]
-    for table in document.tables:
-        parts += [Text(table.caption, style="bold"), terminal_table(table)]
-    parts += [Text(note, style="bold red") for note in document.notes]
+    parts: list[Any] = [Prose(document.setting), Text()]
+    for table in document.tables[:tables]:
+        parts += [Prose(table.caption, "bold"), Fitted(table), Text()]
+    parts += map(Prose, sentences)
+    parts += [Prose(note, "bold red") for note in document.notes]
     return Group(*parts)
-
-
-def terminal_table(table: Table) -> Any:
-    """A table of rich."""
-    from rich import box
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
-    drawn = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, header_style="")
-    for j, header in enumerate(table.headers):
-        justify: Any = "right" if table.numeric(j) else "left"
-        drawn.add_column(Text(header), justify=justify, no_wrap=j == 0)
-    for i, row in enumerate(table.cells):
-        drawn.add_row(
-            *(
-                Text(text, style="bold green" if (i, j) in table.bold else "")
-                for j, text in enumerate(row)
-            )
-        )
-    return drawn

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.envs.extras import install
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.reproduction.record import PAPER_EPISODES, ReproductionRecord
 from slipcar.evaluation.reproduction.runs import PLANS, Rate, trace_integral
@@ -194,7 +195,7 @@ def _solvers(r: ReproductionRecord) -> Iterator[Claim]:
         "the sub-problems can be solved efficiently by off-the-shelf convex solvers",
         f"{names} lead to the same controls within {max(largest, 1e-8):.0e}; times are below"
         if ran
-        else f"not installed: {', '.join(missing)} (pip install 'slipcar[qp]')",
+        else f"not installed: {', '.join(missing)} ({install('qp')})",
         _verdict(largest < 1e-3) if ran else NOT_RUN,
         "np.abs(plan(s, method='convex', solver='osqp').controls - p.controls).max()",
     )

@@ -13,6 +13,7 @@ from typing import Any
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.reproduction.runs import Agreement, PathMoments, Rate, Run
+from slipcar.planner.display import brief
 
 #: Paths of the paper.
 PAPER_EPISODES = 10_000
@@ -45,3 +46,5 @@ class ReproductionRecord:
     agreement: Mapping[str, Agreement]
     solvers: Mapping[str, Mapping[str, Any]]
     provenance: Mapping[str, Any]
+
+    __repr__ = brief

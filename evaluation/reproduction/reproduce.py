@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.compare import evaluate
 from slipcar.evaluation.provenance import provenance
+from slipcar.evaluation.report.comparison import tables_are_in
 from slipcar.evaluation.reproduction.record import PAPER_EPISODES, ReproductionRecord
 from slipcar.evaluation.reproduction.runs import (
     CLEARANCES,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 EPISODES = 100_000
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Reproduction(ReproductionRecord):
     """What :func:`reproduce` returns: its record, and ways to write it.
 
@@ -64,13 +65,8 @@ class Reproduction(ReproductionRecord):
         folder = Path(folder)
         written = self.document(figures=False).save(folder)
         if figures:
-            try:
+            with tables_are_in(folder):
                 from slipcar.evaluation.reproduction import figures as reproduce_figures
-            except ImportError as error:
-                raise ImportError(
-                    f"figures need matplotlib ({error}): pip install 'slipcar[plot]', or do "
-                    f"without (figures=False, --no-figures); the tables are in {folder}"
-                ) from error
             drawn = reproduce_figures.save_all(self, folder)
             written = list(dict.fromkeys([*self.document().save(folder), *drawn]))
         return written

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.metrics import Result
 from slipcar.evaluation.sweep import Row
+from slipcar.planner.display import brief
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,6 +80,8 @@ class SuiteResult:
     warnings: tuple[str, ...]
     wall_time: float
     provenance: dict[str, Any]
+
+    __repr__ = brief
 
     @functools.cached_property
     def frame(self) -> pd.DataFrame:

@@ -14,8 +14,9 @@ import numpy as np
 from slipcar.envs.scenario import Scenario
 from slipcar.evaluation.learned import learned_rows
 from slipcar.evaluation.makers import Maker
+from slipcar.evaluation.metrics import leading
 from slipcar.evaluation.report.document import Document, Figure
-from slipcar.evaluation.report.table import Column, table_of
+from slipcar.evaluation.report.table import Column, Table, table_of
 from slipcar.evaluation.suites.records import Suite, SuiteResult, Variant
 from slipcar.evaluation.suites.shared import frames, notes
 
@@ -65,8 +66,8 @@ def document(result: SuiteResult) -> Document:
     crossed = crossings(result)
     values = [variant.value for variant in result.suite.variants]
     tables = [
-        table_of(costs, "Mean cost of a path against α²", _columns(values, "{:.3f}", 1.0)),
-        table_of(rates, "Collisions at nodes [%] against α²", _columns(values, "{:.2f}", 100.0)),
+        _table(result, costs, "Mean cost of a path against α²", "total", "{:.3f}", 1.0),
+        _table(result, rates, "Collisions at nodes [%] against α²", "collision", "{:.2f}", 100.0),
     ]
     if len(crossed):
         tables.append(
@@ -155,11 +156,28 @@ def crossings(result: SuiteResult) -> pd.DataFrame:
     return frame
 
 
-def _columns(values: list[float], form: str, scale: float) -> tuple[Column, ...]:
-    def column(key: str) -> Column:
-        return Column(key, lambda row: form.format(scale * row[key]), key)
+def _table(
+    result: SuiteResult, frame: pd.DataFrame, caption: str, metric: str, form: str, scale: float
+) -> Table:
+    """One column for each α²; a row is emphasised where no interval ties another to it."""
+    marks = {}
+    for variant in result.suite.variants:
+        found = leading(
+            {
+                row: cell
+                for row in result.suite.rows
+                if (cell := result.results.get((row, variant.label))) is not None
+            },
+            metric,
+        )
+        winner = found.winner if found is not None else None
+        marks[f"{variant.value:g}_best"] = [row == winner for row in frame.index]
 
-    return tuple(column(f"{value:g}") for value in values)
+    def column(key: str) -> Column:
+        return Column(key, lambda row: form.format(scale * row[key]), key, f"{key}_best")
+
+    columns = tuple(column(str(key)) for key in frame.columns)
+    return table_of(frame.assign(**marks), caption, columns)
 
 
 _CROSSING = (

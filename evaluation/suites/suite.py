@@ -109,7 +109,7 @@ def save_suite(
         result: what came of the suite.
         document: made of it.
         folder: made if it does not exist.
-        figures: also draw the figure (`pip install slipcar[plot]`).
+        figures: also draw the figure (needs matplotlib).
     """
 
     def draw() -> list[Path]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.planner.display import brief, facts
 from slipcar.planner.extremal.maximum_principle import (
     FirstOrder,
     Scales,
@@ -57,6 +58,8 @@ class Violations:
     outside: float  # and from U
     adjoint: Array  # λ_1..λ_K = −p_1..−p_K by the recursion, (K, n)
     scales: Scales
+
+    __repr__ = brief
 
     @property
     def relative(self) -> dict[str, float]:
@@ -199,8 +202,19 @@ class Certificate:
         }
         return sorted(excess, key=lambda name: -excess[name])
 
-    def __str__(self) -> str:
-        v, relaxed, ended = self.violations, int(self.relaxed.sum()), f" ({self.status})"
+    def __repr__(self) -> str:
+        return f"Certificate({self.verdict})"
+
+    def _repr_html_(self) -> str:
+        relative = {name: f"{value:.1e} of its scale" for name, value in self.residuals.items()}
+        rows = {"smallest |p⁰_k|": f"{self.smallest_cost_multiplier:.3g}", **relative}
+        failed = [f"not met: {', '.join(self._failed())}"] if not self.extremal else []
+        return facts(f"Certificate: {self.verdict}", rows, failed)
+
+    @property
+    def verdict(self) -> str:
+        """What came out, in a line."""
+        ended = f" ({self.status})"
         if self.extremal:
             verdict = f"EXTREMAL to {self.residual:.1e}: the maximum principle holds"
         else:
@@ -211,8 +225,12 @@ class Certificate:
                 verdict = f"NO extremal: {worst} violated by {size} of its scale"
             if self.status.ok:
                 ended = " (CONVERGED: ask for a smaller tolerance)"
+        return verdict + ended
+
+    def __str__(self) -> str:
+        v, relaxed = self.violations, int(self.relaxed.sum())
         lines = [
-            verdict + ended,
+            self.verdict,
             f"  normal      min |p⁰_k| = {self.smallest_cost_multiplier:.3g} over "
             f"{len(self.cost_history)} iterations"
             + (f", {relaxed} with a relaxed terminal condition" if relaxed else ""),

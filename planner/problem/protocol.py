@@ -49,6 +49,9 @@ class Problem(Protocol):
     * `start_covariance` (n, n): of x(0), symmetric positive semidefinite, with the mean `start`;
       zero otherwise.
     * `angles`: state components of period 2π, so that feedback wraps their errors.
+    * `state_names` (n) and `control_names` (m), texts with their units, `plane` (i, j), the two
+      states that span the plane it happens in, and `draw(axes)`, which draws what is there: for
+      `Plan.plot`, `Plan.to_frame` and `Plan.to_xarray`.
     * `decode_observation(obs)` -> (t, x) and `encode_control(u)` -> action, for controllers
       that act in an environment.
 

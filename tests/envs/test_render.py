@@ -344,7 +344,7 @@ def test_a_missing_pygame_is_explained(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = SlipCarEnv(render_mode="rgb_array")
     env.reset(seed=0)
-    with pytest.raises(DependencyNotInstalled, match=r'pip install "slipcar\[plot\]"'):
+    with pytest.raises(DependencyNotInstalled, match=r"pip install .*'pygame-ce>="):
         env.render()
 
 

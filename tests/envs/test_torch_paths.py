@@ -222,7 +222,7 @@ def test_bad_arguments_are_named():
 def test_without_torch_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     for call in (lambda: draw_noise(PAPER, 1), torch_backend.torch_module):
-        with pytest.raises(ImportError, match=r"pip install \"slipcar\[rl\]\""):
+        with pytest.raises(ImportError, match="pip install 'torch>="):
             call()
 
 

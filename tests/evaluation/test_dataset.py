@@ -295,7 +295,7 @@ def test_without_minari_the_error_names_the_extra(capsys, folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "minari", None)
     monkeypatch.setitem(sys.modules, "minari.data_collector", None)
     assert main(["dataset", "scp", "--id", "a-v0"]) == 2
-    assert 'pip install "slipcar[data]"' in capsys.readouterr().err
+    assert "pip install 'minari[hdf5]>=" in capsys.readouterr().err
 
 
 def test_words_for_controllers(tmp_path, monkeypatch):

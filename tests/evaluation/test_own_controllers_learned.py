@@ -237,6 +237,6 @@ def test_missing_packages_are_named(paper, car, tmp_path, monkeypatch):
     save(path, sb3.PPO, car(), **KINDS["PPO"])
     monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
     with pytest.raises(
-        ImportError, match=r"PPO model, which needs stable_baselines3 .*slipcar\[rl\]"
+        ImportError, match=r"PPO model, which needs stable_baselines3 .*pip install 'torch>="
     ):
         load_controller(str(path), paper, trust=True)

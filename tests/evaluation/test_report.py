@@ -187,7 +187,7 @@ def test_tables_are_there_when_drawing_fails(compared, tmp_path):
     def draw():
         raise ImportError("No module named 'matplotlib'")
 
-    with pytest.raises(ImportError, match=r"slipcar\[plot\].*the tables are in"):
+    with pytest.raises(ImportError, match=r"pip install 'matplotlib>=.*the tables are in"):
         save_document(document(compared), tmp_path, draw, {}, lambda: {"rows": []})
     back = read_document(tmp_path)
     assert back.tables == document(compared).tables

@@ -6,6 +6,7 @@ from slipcar.evaluation.statistics import (
     cvar,
     episodes_for,
     half_width,
+    leader,
     paired_difference,
     standard_error,
     student_interval,
@@ -193,3 +194,37 @@ def test_heavy_tails_keep_their_variance_in_groups():
     _, low, high = bca_interval(values)
     half = 1.96 * standard_error(values)
     assert high - low == pytest.approx(2.0 * half, rel=0.1)
+
+
+# ------------------------------------------------------------------ who is the winner
+
+
+def led(**samples):
+    found = {name: np.asarray(values, dtype=float) for name, values in samples.items()}
+    return leader(
+        {name: values.mean() for name, values in found.items()},
+        lambda name, other: paired_difference(found[name], found[other]),
+    )
+
+
+def test_a_winner_is_below_every_other_beyond_the_interval():
+    noise = np.random.default_rng(0).normal(size=400)
+    first = led(a=noise + 1.0, b=noise, c=-noise + 5.0)
+    assert (first.name, first.tied, first.winner) == ("b", (), "b")
+
+
+def test_what_the_interval_does_not_separate_is_tied_and_nobody_wins():
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(2, 400))
+    first = led(a=a, b=b + 0.01, far=a + 3.0)
+    other = {"a": "b", "b": "a"}[first.name]
+    assert first.tied == (other,)
+    assert first.winner is None
+    assert led(a=a, b=a).tied == ("b",)
+
+
+def test_nobody_leads_alone_and_nan_takes_no_part():
+    assert led(a=np.ones(5)) is None
+    assert led(a=np.ones(5), b=np.full(5, np.nan)) is None
+    first = led(a=np.ones(50), b=np.full(50, np.nan), c=np.arange(50) + 3.0)
+    assert (first.winner, first.tied) == ("a", ())

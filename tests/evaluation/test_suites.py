@@ -135,16 +135,28 @@ def test_nothing_to_compare_with_is_no_difference(others, reference):
 
 
 def test_who_gives_up_hard_worlds_is_not_the_best():
-    easy, reference = suite_random.suite(16, 3).variants[1].scenario, suite_random.REFERENCE
-    straight = Maker.of("straight")
-    rows = {"easy": OnlyIn(easy.goal.tobytes()), "all": straight, reference: straight}
-    table = suite_random.document(of_random(rows, worlds=3)).tables[0]
-    worlds = table.headers.index("worlds")
+    suite = suite_random.suite(16, 3)
+    easy, reference = suite.variants[1].scenario, suite_random.REFERENCE
+    rows = {
+        "easy": OnlyIn(easy.goal.tobytes()),
+        "plans": Maker.of("planned-feedback"),
+        reference: Maker.of("straight"),
+    }
+    result = of_random(rows, worlds=3)
+    table = suite_random.document(result).tables[0]
+    worlds, cost = table.headers.index("worlds"), table.headers.index("total cost")
     assert [row[worlds] for row in table.cells] == ["1", "3", "3"]
-    assert {row for row, _ in table.bold} == {1, 2}
-    cost = table.headers.index("total cost")
     assert "±" not in table.cells[0][cost]  # one world has no error, but a mean
     assert float(table.cells[0][cost]) > 0.0
+    totals = result.frame.pivot(index="variant", columns="controller", values="total")
+    assert (totals["plans"] < totals[reference]).all()
+    assert table.bold == {(1, cost)}
+
+
+def test_rows_that_no_interval_separates_have_no_winner():
+    straight = Maker.of("straight")
+    table = suite_random.document(of_random({"a": straight, "b": straight}, worlds=3)).tables[0]
+    assert table.bold == frozenset()
 
 
 def test_no_collision_in_any_world_is_not_certainty():

@@ -28,9 +28,7 @@ class CvxpySolver:
         installed = cp.installed_solvers()
         chosen = solver or next((name for name in _SOLVERS if name in installed), None)
         if chosen is None:
-            raise ImportError(
-                f'cvxpy has none of {list(_SOLVERS)} installed: pip install "slipcar[qp]"'
-            )
+            raise ImportError(f"cvxpy has none of {list(_SOLVERS)} installed: pip install clarabel")
         self.solver = chosen
 
     def solve(self, sub: Subproblem) -> Solution:

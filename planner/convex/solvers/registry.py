@@ -41,6 +41,6 @@ def make_solver(name: str) -> Solver:
         return BACKENDS[name]()
     except ModuleNotFoundError as error:
         raise ImportError(
-            f'solver={name!r} needs the package {error.name}: pip install "slipcar[qp]"; '
+            f"solver={name!r} needs the package {error.name}: pip install {error.name}; "
             f"solver='structured' needs none"
         ) from error
