@@ -56,8 +56,8 @@ class Task:
     x: Array  #: guess, (N, n)
     u: Array  #: guess, (K, m)
     free_first: bool = False  #: whether to leave penalties out at first
-    bold_steps: int | None = None  #: steps that the convex scheme takes whole; None is its default
     label: str = ""  #: for people
+    bold_steps: int | None = None  #: steps that the convex scheme takes whole; None is its default
 
 
 def completed(problem: Problem, options: Options) -> Model:
