@@ -57,6 +57,7 @@ class Task:
     u: Array  #: guess, (K, m)
     free_first: bool = False  #: whether to leave penalties out at first
     label: str = ""  #: for people
+    judged: bool = False  #: whether Newton's method judges its first steps, too
     bold_steps: int | None = None  #: steps that the convex scheme takes whole; None is its default
 
 
@@ -100,7 +101,7 @@ def attempt(task: Task, options: Options, *, history: bool = True) -> Outcome:
     if limit > _OWN:
         limit = _OWN + int(_SHARED * (limit - _OWN))
     ended: list[Outcome] = []
-    for judged in (False, True):
+    for judged in (True,) if task.judged else (False, True):
         outcome = _newton(task, options.with_iterations(limit), judged=judged, history=history)
         if outcome.status in (Status.CONVERGED, Status.STOPPED):
             return _joined([*ended, outcome])

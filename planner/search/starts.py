@@ -71,8 +71,16 @@ def multistart(
     for i, task in enumerate(initial_guesses(model, count, posed)):
         with naming(f"guess {i}"):
             outcomes.append((task, attempt(task, options)))
-    outcomes.sort(key=lambda pair: _rank(pair[1]))
     classify = getattr(model.problem, "homotopy_class", None) or (lambda x: None)
+    # Bold steps may leave the way of their guess: where no plan goes it, judged ones keep to it.
+    gone = {classify(outcome.x) for _, outcome in outcomes}
+    for task, _ in tuple(outcomes):
+        if task.posed is not None and (way := classify(task.x)) not in gone:
+            label = f"{task.label}, judged"
+            kept = dataclasses.replace(task, free_first=False, judged=True, label=label)
+            outcomes.append((kept, attempt(kept, options)))
+            gone |= {way, classify(outcomes[-1][1].x)}
+    outcomes.sort(key=lambda pair: _rank(pair[1]))
     rows: list[Alternative] = []
     different: list[tuple[Alternative, Array, Outcome]] = []
     for task, new in outcomes:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slipcar.envs import Scenario, routes
+from slipcar.envs import Scenario, routes, ways
 
 WORLDS = [Scenario.random(seed, turned=True) for seed in (0, 3, 7, 11, 42)]
 
@@ -95,6 +95,46 @@ def test_class_does_not_depend_on_where_the_world_lies():
         assert moved.homotopy_class(move(path)) == world.homotopy_class(path)
 
 
+# ---------------------------------------------------------------- ways
+
+
+def test_greens_function_solves_the_clamped_beam():
+    # r⁗ = δ(s − s₀) with r = r′ = 0 at both ends: the end conditions, by one-sided differences;
+    # symmetry; and ∫ G(s, s₀) ds₀ = s²(1 − s)²/24, the beam under an even load.
+    G = ways._greens_function(401)
+    s = np.linspace(0.0, 1.0, 401)
+    np.testing.assert_allclose(G, G.T, atol=1e-16)
+    np.testing.assert_allclose(G[[0, -1]], 0.0, atol=1e-16)
+    assert np.abs(G[1]).max() < 1e-5
+    np.testing.assert_allclose(np.trapezoid(G, s, axis=1), s**2 * (1 - s) ** 2 / 24, atol=1e-9)
+
+
+def test_a_way_is_the_optimum_of_bending_and_penalty():
+    # Against a plain quadratic programme in the nodes: ½ Σ (Δ²r)²/h³ + ½ κ max(0, b − n·r_k)².
+    world = disc(2.0, 0.1, 0.5).replace(nodes=201)
+    way = next(w for w in ways.ways(world, 4) if len(w.sides) == 1)
+    normal = np.array([0.0, float(next(iter(way.sides.values())))])
+    reach = 0.5 + world.clearance
+    k = int(np.argmin(np.hypot(*(ways.cubic(world) - (2.0, 0.1)).T)))
+    h = 1.0 / 200
+    D = (np.eye(199, 201) - 2.0 * np.eye(199, 201, 1) + np.eye(199, 201, 2)) / h**2
+    ends = 2.0 * np.eye(1, 201, 1) / h**2, 2.0 * np.eye(1, 201, 199) / h**2
+    second = np.vstack([ends[0], D, ends[1]])  # of deviations, which vanish at both ends
+    lengths = np.full(201, h)
+    lengths[[0, -1]] = h / 2
+    kappa = ways._stiffness(world, np.array([reach]))[0]
+    H = second.T @ (lengths[:, None] * second)
+    gain = np.zeros(201)
+    gain[k] = 1.0
+    y0 = ways.cubic(world)[:, 1]
+    rim = normal[1] * 0.1 + reach
+    A, b = H + kappa * np.outer(gain, gain), kappa * gain * (normal[1] * rim - y0[k])
+    free = slice(1, -1)
+    bump = np.zeros(201)
+    bump[free] = np.linalg.solve(A[free, free], b[free])
+    np.testing.assert_allclose(way.path[:, 1] - y0, bump, atol=2e-3)
+
+
 # ---------------------------------------------------------------- routes
 
 
@@ -115,8 +155,12 @@ def test_routes_are_trajectories_of_the_problem(world):
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_no_two_routes_share_class_and_gear(world):
-    kinds = [(world.homotopy_class(x), "backwards" in label) for label, x, _ in world.guesses(16)]
+def test_no_two_routes_share_class_and_heading(world):
+    def half_turns(x):
+        k = world.nodes // 2
+        return round((x[k, 2] - math.atan2(*(x[k + 1] - x[k])[1::-1])) / math.pi)
+
+    kinds = [(world.homotopy_class(x), half_turns(x)) for _, x, _ in world.guesses(16)]
     assert len(set(kinds)) == len(kinds) > 2
 
 
@@ -144,7 +188,10 @@ def test_routes_come_ranked_and_the_same_each_time():
     ],
 )
 def test_a_route_clears_the_obstacles_where_there_is_a_passage(world):
-    clear = [world.signed_distance(x).min() >= world.clearance for _, x, _ in world.guesses(8)]
+    # It may touch the clearance ring, as plans do, which only pay for that.
+    clear = [
+        world.signed_distance(x).min() >= 0.5 * world.clearance for _, x, _ in world.guesses(8)
+    ]
     assert clear[0]
 
 

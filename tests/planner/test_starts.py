@@ -179,7 +179,7 @@ def test_several_starts_are_never_worse_than_one(seed):
     assert several.status is Status.CONVERGED
     assert several.cost <= one.cost * (1.0 + 1e-6)
     assert objective(several) == tried[0].cost
-    assert 2 <= len(tried) <= 7
+    assert 2 <= len(tried) <= 2 * 7  # some twice, where bold steps left the way
 
 
 def test_several_starts_beat_one_where_the_straight_way_is_the_wrong_one():
