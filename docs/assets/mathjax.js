@@ -2,5 +2,5 @@
 window.MathJax = {
   tex: { inlineMath: [["\\(", "\\)"]], displayMath: [["\\[", "\\]"]], processEscapes: true },
   options: { ignoreHtmlClass: ".*|", processHtmlClass: "arithmatex", enableMenu: false },
-  svg: { fontCache: "local", matchFontHeight: false },
+  svg: { fontCache: "local", scale: 0.9 },
 };

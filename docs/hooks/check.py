@@ -73,12 +73,14 @@ def at_hand(url: str) -> bool:
 def findings(context, path: Path) -> list[str]:
     """What is wrong with a page."""
     page = context.new_page()
-    lines, asked = [], []
+    lines, asked, heard = [], [], []
     page.on("pageerror", lambda error: lines.append(f"error: {error}"))
+    page.on("console", lambda said: said.type in ("error", "warning") and heard.append(said.text))
     page.on("request", lambda request: asked.append(request.url))
     page.goto(path.as_uri())
     page.evaluate("window.MathJax && MathJax.startup && MathJax.startup.promise")
     lines += [f"asks for {url}" for url in asked if not at_hand(url)]
+    lines += [f"says {text}" for text in heard]
     if page.evaluate(UNSET):
         lines.append("its mathematics is not typeset")
     for violation in Axe().run(page).response["violations"]:
