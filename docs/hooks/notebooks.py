@@ -16,6 +16,7 @@ from nbclient import NotebookClient
 
 #: What a terminal would turn into colours.
 ESCAPES = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+LINK = re.compile(r"(\]\([^)\s:]+)\.ipynb(?=[)#])")
 #: Executed notebooks by source, for `mkdocs serve`, which builds again and again.
 _DONE = {}
 
@@ -34,6 +35,11 @@ def on_files(files, config):
         for uri, content in beside.items():
             files.append(File.generated(config, uri, content=content))
     return files
+
+
+def on_page_markdown(markdown, **_):
+    """Links to notebooks, as the repository has them, lead to their pages."""
+    return LINK.sub(r"\1.md", markdown)
 
 
 def run(path):
@@ -66,6 +72,6 @@ def as_markdown(notebook, name):
                 parts.append(f'<div class="output" markdown="0">\n{data["text/html"]}\n</div>')
             elif text := output.get("text", data.get("text/plain", "")):
                 parts.append(f"````text\n{ESCAPES.sub('', text).rstrip()}\n````")
-    download = f"[This page as a notebook]({name}.ipynb){{: download }}"
+    download = f'<a href="{name}.ipynb" download>This page as a notebook</a>'
     title, *rest = parts
     return "\n\n".join([title, download, *rest]) + "\n", pictures
