@@ -117,7 +117,7 @@ def built(uv: Path, folder: Path) -> Path:
     source.mkdir()
     for name in ("planner", "envs", "baselines", "evaluation"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     run(uv, "build", "-q", "--wheel", "--out-dir", folder / "wheel", source)
     return next((folder / "wheel").glob("*.whl"))

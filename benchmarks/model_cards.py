@@ -1,7 +1,7 @@
 """Write a model card beside each shipped policy: python benchmarks/model_cards.py.
 
-One card a method and world, for all its seeds: baselines/weights/WORLD/METHOD.md. Everything in it is
-read from the records beside the weights; what cannot be is what the method is, and where it ends.
+One card a method and world, for all its seeds: baselines/weights/WORLD/METHOD.md. Its numbers are
+read from the records beside the weights.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from slipcar.baselines import shipped_methods, shipped_runs
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "baselines" / "weights"
 WORLDS = {
-    "paper": 'the paper\'s scenario, `Scenario.named("paper")`: one world, 5 s, four obstacles that '
-    "the policy is not shown",
-    "random": "the family `random`: one to eight obstacles, another world every episode, the nearest "
-    "of them in the observation",
+    "paper": """the paper's scenario, `Scenario.named("paper")`: one world, 5 s, and four obstacles
+  that the policy is not shown""",
+    "random": """the family `random`: one to eight obstacles, another world every episode, the
+  nearest of them in the observation""",
 }
 WHAT = {
-    "ppo": "Proximal policy optimisation (Schulman et al. 2017). It learns from costs alone and knows "
-    "nothing of the equations.",
-    "pathwise": "Descent on the expected cost through the derivatives of the simulation; it knows the "
-    "equations.",
-    "cloned": "Least squares on the actions of the planner's feedback, `plan(..., feedback=True)`; it "
-    "knows the equations by its teacher.",
+    "ppo": """Proximal policy optimisation (Schulman et al. 2017). It learns from costs alone and
+  knows nothing of the equations.""",
+    "pathwise": """Descent on the expected cost through the derivatives of the simulation; it knows
+  the equations.""",
+    "cloned": """Least squares on the actions of the planner's feedback, `plan(..., feedback=True)`;
+  it knows the equations by its teacher.""",
 }
 LIMITS = {
-    "paper": "It is for this world and these bounds of the controls. Elsewhere it drives, without a "
-    "warning, past where the goal was. It does not see obstacles.",
-    "random": "It hardly avoids obstacles: see the collisions below. A plan for the world at hand costs less "
-    "and hits less ([why](../../../docs/learning.md)). It shows eight obstacles at most.",
+    "paper": """It is for this world and these bounds of the controls. Elsewhere it drives to where
+  the goal was, without a warning. It does not see obstacles.""",
+    "random": """It hardly avoids obstacles: see the collisions below. A plan for the world at hand
+  costs less and hits less ([why](../../../docs/learning.md)). It shows eight obstacles at most.""",
 }
 
 
@@ -60,8 +60,8 @@ Written by `python benchmarks/model_cards.py`; do not edit.
 
 ## Tests
 
-{first["test"]["episodes"]:,} fresh episodes each (evaluation seed {first["test"]["seed"]}); cost of a path with
-its standard error.
+{first["test"]["episodes"]:,} fresh episodes each (evaluation seed {first["test"]["seed"]}); cost
+of a path with its standard error.
 
 | seed | cost | collisions | effort | obstacle | goal | training [s] | environment steps |
 |---|---|---|---|---|---|---|---|
