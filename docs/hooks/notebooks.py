@@ -48,7 +48,9 @@ def run(path):
     if text not in _DONE:
         notebook = nbformat.reads(text, as_version=4)
         if os.environ.get("SLIPCAR_DOCS_NOTEBOOKS") != "0":
-            NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+            NotebookClient(
+                notebook, timeout=120, kernel_name="python3", extra_arguments=["--log-level=ERROR"]
+            ).execute()
         _DONE[text] = notebook
     return _DONE[text]
 
