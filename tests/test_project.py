@@ -105,6 +105,8 @@ def test_the_citation_is_of_this_version():
     assert citation["license"] == PROJECT["license"]
     assert citation["authors"] == PROJECT["authors"]
     assert "Pavone" in str(citation["references"])
+    bibtex = (ROOT / "docs" / "bibliography.md").read_text(encoding="utf-8")
+    assert f"version = {{{PROJECT['version']}}}" in bibtex
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """What a command prints stands on a page because it was run when the site was built.
 
-A line `<!-- printed: slipcar plan --help -->` is replaced by the command and its output.
+A line `<!-- printed: slipcar plan --help -->` is replaced by the command and its output; with
+`COMMAND` for the command, by a section for each that there is.
 """
 
 import os
@@ -12,12 +13,22 @@ import tempfile
 
 from mkdocs.exceptions import PluginError
 
+from slipcar.evaluation.cli import COMMANDS
+
 MARK = re.compile(r"^<!-- printed: (slipcar .*?) -->$", re.MULTILINE)
+EVERY = re.compile(r"^<!-- printed: (slipcar) COMMAND (.*?) -->$", re.MULTILINE)
 _DONE = {}
 
 
 def on_page_markdown(markdown, **_):
     """Run what the marks of a page name."""
+    markdown = EVERY.sub(
+        lambda mark: "\n\n".join(
+            f"## slipcar {name}\n\n<!-- printed: {mark[1]} {name} {mark[2]} -->"
+            for name in COMMANDS
+        ),
+        markdown,
+    )
     return MARK.sub(lambda mark: f"```text\n$ {mark[1]}\n{printed(mark[1])}\n```", markdown)
 
 
