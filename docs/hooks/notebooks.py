@@ -16,6 +16,8 @@ from nbclient import NotebookClient
 
 #: What a terminal would turn into colours.
 ESCAPES = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+#: How pandas opens a table, dressed for another house.
+PANDAS = re.compile(r"(?:<style scoped>.*?</style>\s*)?<table[^>]*>", re.DOTALL)
 LINK = re.compile(r"(\]\([^)\s:]+)\.ipynb(?=[)#])")
 #: Executed notebooks by source, for `mkdocs serve`, which builds again and again.
 _DONE = {}
@@ -55,6 +57,17 @@ def run(path):
     return _DONE[text]
 
 
+def merged(outputs):
+    """What was printed by turns, in one piece."""
+    pieces = []
+    for output in outputs:
+        if pieces and "text" in output and "text" in pieces[-1]:
+            pieces[-1] = {"text": pieces[-1]["text"] + output["text"]}
+        else:
+            pieces.append(output)
+    return pieces
+
+
 def as_markdown(notebook, name):
     """Markdown of a notebook, and its pictures by file name."""
     parts, pictures = [], {}
@@ -63,7 +76,7 @@ def as_markdown(notebook, name):
             parts.append(cell.source)
             continue
         parts.append(f"```python\n{cell.source}\n```")
-        for output in cell.get("outputs", []):
+        for output in merged(cell.get("outputs", [])):
             data = output.get("data", {})
             if "image/png" in data:
                 key = f"{name}-{len(pictures)}.png"
@@ -71,7 +84,8 @@ def as_markdown(notebook, name):
                 alt = cell.metadata.get("alt", "What this cell draws")
                 parts.append(f"![{alt}]({key})")
             elif "text/html" in data:
-                parts.append(f'<div class="output" markdown="0">\n{data["text/html"]}\n</div>')
+                html = PANDAS.sub("<table>", data["text/html"])
+                parts.append(f'<div class="output" markdown="0">\n{html}\n</div>')
             elif text := output.get("text", data.get("text/plain", "")):
                 parts.append(f"````text\n{ESCAPES.sub('', text).rstrip()}\n````")
     download = f'<a href="{name}.ipynb" download>This page as a notebook</a>'
