@@ -4,7 +4,8 @@ new MutationObserver(() => {
   document.querySelectorAll("nav.md-code__nav").forEach((bar, i) => {
     if (!bar.hasAttribute("aria-label")) bar.setAttribute("aria-label", `Code ${i + 1}`);
   });
-  for (const box of document.querySelectorAll(".md-typeset__scrollwrap:not([tabindex]), .output:not([tabindex])")) {
-    box.setAttribute("tabindex", "0");
+  const scrolling = '.md-typeset__scrollwrap, .output, mjx-container[display="true"]';
+  for (const box of document.querySelectorAll(scrolling)) {
+    if (!box.hasAttribute("tabindex")) box.setAttribute("tabindex", "0");
   }
 }).observe(document, { childList: true, subtree: true });
