@@ -33,8 +33,9 @@ PLACE := $(shell pwd | cksum | cut -d' ' -f1)
 CREATED := $(VENV)/created-$(PLACE)
 INSTALLED := build/installed-$(STATE)
 BENCH_INSTALLED := build/installed-bench-$(STATE)
+DOCS_INSTALLED := build/installed-docs-$(STATE)
 
-.PHONY: help install compare suites frontier reproduce report kills matrix test test-long fuzz train bench bench-worlds bench-docs lint types lock peers clean
+.PHONY: help install compare suites frontier reproduce report kills matrix test test-long fuzz train bench bench-worlds bench-docs docs docs-serve docs-check lint types lock peers clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -90,6 +91,15 @@ bench-worlds: $(BENCH_INSTALLED)  ## plan for 1000 random worlds, ours and IPOPT
 bench-docs: $(BENCH_INSTALLED)  ## every benchmark once more, into docs/benchmarks*.md
 	$(BIN)/python benchmarks/run.py --docs $(ARGS)
 
+docs: $(DOCS_INSTALLED)  ## the documentation site, notebooks executed; site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict $(ARGS)
+
+docs-serve: $(DOCS_INSTALLED)  ## the site at http://127.0.0.1:8000, built anew when a page changes
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve $(ARGS)
+
+docs-check: docs  ## the site in a browser: accessible (axe), nothing fetched, links that lead somewhere
+	$(BIN)/python docs/hooks/check.py site $(ARGS)
+
 lint: types  ## ruff (rules and format), mypy and pyright
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -100,7 +110,7 @@ types: $(INSTALLED)  ## mypy over the installed package; mypy and pyright over a
 	$(BIN)/basedpyright
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare suites frontier reproduce kills matrix fuzz train bench bench-worlds bench-docs: export OMP_NUM_THREADS ?= 1
+compare suites frontier reproduce kills matrix fuzz train bench bench-worlds bench-docs docs docs-serve: export OMP_NUM_THREADS ?= 1
 
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
@@ -123,6 +133,11 @@ $(BENCH_INSTALLED): $(INSTALLED)
 	@$(PIP) -c constraints.txt 'slipcar[bench]'
 	@touch $@
 
+$(DOCS_INSTALLED): $(INSTALLED)
+	@echo 'Installing what the documentation site is built with ...'
+	@$(PIP) -c constraints.txt 'slipcar[docs]'
+	@touch $@
+
 # Their requirements contradict our pins: they run as workers of the benchmark in a venv of their own.
 peers:  ## add crocoddyl and OpenSCvx to `make bench` (2 GB)
 	$(PYTHON) -m venv build/peers
@@ -135,12 +150,12 @@ lock:  ## renew constraints.txt with the newest versions that pyproject.toml adm
 	$(PYTHON) -m venv build/lock
 	build/lock/bin/python -m pip -qq install 'pip>=25.1'
 	build/lock/bin/python -m pip -qq install $(TORCH_ARGS) $(TORCH)
-	build/lock/bin/python -m pip -qq install --group dev '.[all,bench]'
+	build/lock/bin/python -m pip -qq install --group dev '.[all,bench,docs]'
 	build/lock/bin/python -m pip freeze --all --exclude pip --exclude slipcar > build/lock/pins
 	{ echo '# Made by `make lock`: do not edit.'; \
 		sed -E 's/^(torch==[^+]*)\+.*/\1/' build/lock/pins; } > constraints.txt
 	rm -rf build/lock
 
 clean:  ## remove everything that make made, results and runs excepted
-	rm -rf $(VENV) build dist slipcar.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site slipcar.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

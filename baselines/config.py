@@ -1,4 +1,4 @@
-"""What a training run is made of, as data (SPEC §6)."""
+"""What a training run is made of, as data (docs/learning.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from slipcar.envs.sources import Source
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Proximal policy optimisation (Schulman et al. 2017), as measured to work here (SPEC §6).
+    """Proximal policy optimisation (Schulman et al. 2017), as it works here (docs/learning.md).
 
     A rollout is one whole episode in every environment. What breaks learning: observation
     normalisation, log_std 0, rewards x 0.02, potential shaping, λ 0.9.

@@ -2,8 +2,8 @@
 
     min ∫ ‖u‖² + λ Σ_o max(0, c_o(r))² dt    s.t.  ẋ = b(x, u),  x(0) = x⁰,  x(T) = x^f
 
-the stochastic problem with variance weight zero (SPEC §2): what one would plan for a car that
-does not slip. The covariance of the plan is still predicted, so that it can be judged.
+the stochastic problem with variance weight zero (docs/method.md): what one would plan for a car
+that does not slip. The covariance of the plan is still predicted, so that it can be judged.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 
 o is an observation of :mod:`slipcar.envs.observation`: `features` on one scenario; with the nearest
 obstacles in the slots behind it for worlds that vary. This is the mean of the Gaussian that PPO
-trains (SPEC §6); sampling it needs `log_std` as well.
+trains (docs/learning.md); sampling it needs `log_std` as well.
 """
 
 from __future__ import annotations

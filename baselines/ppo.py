@@ -1,4 +1,4 @@
-"""Train the learning baseline: PPO without access to any plan (SPEC §6).
+"""Train the learning baseline: PPO without access to any plan (docs/learning.md).
 
     policy = train_ppo("paper", PPOConfig(total_steps=3_000_000), seed=0, folder="runs/ppo")
     policy = train_ppo("family:random")        # another world every episode

@@ -1,7 +1,7 @@
 """The car and its costs in CasADi's symbols, once for all CasADi contenders.
 
-Written from SPEC §2, because CasADi must see symbols; the judge (:mod:`contenders`), which knows
-slipcar's own definitions only, would notice a difference in every row.
+Written from docs/method.md, because CasADi must see symbols; the judge (:mod:`contenders`), which
+knows slipcar's own definitions only, would notice a difference in every row.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@
 A wheel is built, and installed with every extra into an environment of its own for each Python
 from 3.11 to 3.14 that this machine has (in ~/.pyenv, or where `uv` finds it) and for either end:
 the oldest version of each direct dependency that has a wheel for that Python, and the newest of
-all. Then `matrix_smoke.py` runs there: import, plan, environments, comparison, files. The
-environments are temporary and apart from the checkout's; PyPI is needed, and `uv` is taken from it
-if it is missing.
+all. Then `matrix_smoke.py` runs there (import, plan, environments, comparison, files) and the quick
+part of the tests. The environments are temporary and apart from the checkout's; PyPI is needed, and
+`uv` is taken from it if it is missing.
 
 torch is installed only where it is asked for (--torch torch==2.13.0, by pip with its own settings),
 as a build for a GPU has gigabytes; without it the extra `rl` is left out.
@@ -34,6 +34,16 @@ ENDS = {"oldest": "lowest-direct", "newest": "highest"}
 EXTRAS = ("plot", "qp", "video", "data", "cluster", "report")
 LEARNING = "rl"
 MINUTES = 15
+TESTING = ("pytest", "hypothesis", "packaging")
+#: The quick part of the tests: half a minute, every package, no tool of developers.
+QUICK = (
+    "envs/test_car.py", "envs/test_cost.py", "envs/test_scenario.py", "envs/test_slip_car.py",
+    "envs/test_observation.py", "envs/test_registration.py", "planner/test_trace_graph.py",
+    "planner/test_moments.py", "planner/test_plan_file.py", "planner/test_newton_kernels.py",
+    "planner/test_certificate.py", "planner/test_feedback_gains.py",
+    "evaluation/test_statistics.py", "evaluation/test_metrics.py", "baselines/test_policy.py",
+    "baselines/test_policy_storage.py",
+)  # fmt: skip
 
 
 def main() -> int:
@@ -117,7 +127,7 @@ def built(uv: Path, folder: Path) -> Path:
     source.mkdir()
     for name in ("planner", "envs", "baselines", "evaluation"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     run(uv, "build", "-q", "--wheel", "--out-dir", folder / "wheel", source)
     return next((folder / "wheel").glob("*.whl"))
@@ -146,6 +156,14 @@ def tried(
     (place / "smoke.txt").write_text(smoke.stdout + smoke.stderr)
     if smoke.returncode:
         return "FAILED", _last(smoke.stderr)
+    run(uv, "pip", "install", "-q", "--python", interpreter, *TESTING)
+    tests = run(
+        interpreter, "-m", "pytest", "-q", "-p", "no:cacheprovider",
+        *(ROOT / "tests" / name for name in QUICK), check=False, cwd=ROOT,
+    )  # fmt: skip
+    (place / "tests.txt").write_text(tests.stdout + tests.stderr)
+    if tests.returncode:
+        return "FAILED", "tests: " + _last(tests.stdout)
     return "passed", smoke.stdout.strip().splitlines()[-1]
 
 

@@ -1,6 +1,6 @@
 """The recipe of the experiment released with the paper, with every sub-problem left to IPOPT.
 
-SPEC §2, column "released experiment": the dynamics are linearised at the last iterate, the
+What docs/reproduction.md calls released: the dynamics are linearised at the last iterate, the
 obstacle potential, squared and non-convex, is left to the solver as it is, the end is a box of
 ±10⁻³ round the goal, and the covariance is not in the cost.
 
@@ -8,7 +8,7 @@ obstacle potential, squared and non-convex, is left to the solver as it is, the 
               x_{k+1} = f(x̄_k, ū_k) + ∂f (x_k − x̄_k, u_k − ū_k)
 
 The iterate is a parameter of a programme that is built once. What differs from the released
-code favours it: it builds the programme anew each time (16 s a plan, SPEC §3.6), and carries
+code favours it: it builds the programme anew each time (16 s a plan, as measured once), and carries
 a trust region (Δ₀ = 50) that is never active here and the covariance that this needs.
 """
 

@@ -1,4 +1,4 @@
-"""What a path costs and when it collides: the only definition (SPEC §2).
+"""What a path costs and when it collides: the only definition (docs/method.md).
 
     effort   = Σ_{k=0}^{N-2} dt ‖u_k‖²
     obstacle = Σ_{k=1}^{N-1} dt λ Σ_o max(0, c_o(r_k))²,   c_o(r) = (δ_o + ε)² − ‖r − r_o‖²

@@ -1,6 +1,6 @@
 """What a policy sees, and the way back to (t, x).
 
-`features` (default, 12 numbers scaled by hand to order one; SPEC §5):
+`features` (default, 12 numbers scaled by hand to order one; docs/slipcar-v0.md):
 
     0:2   (goal − position) / 1 m
     2:4   cos θ, sin θ

@@ -42,7 +42,7 @@ Policy: TypeAlias = "Callable[[float, Tensor], Tensor]"
 
 
 class PathCosts(NamedTuple):
-    """What each path cost (SPEC §2), and where it ended.
+    """What each path cost (docs/method.md), and where it ended.
 
     Attributes:
         effort: Σ dt ‖u_k‖², (paths,).

@@ -12,7 +12,7 @@ MAX_RANDOM_OBSTACLES = 8
 #: Fields of the named scenarios; what is not given is Scenario's default, or that of the one
 #: which it is `like`.
 NAMED: dict[str, dict[str, Any]] = {
-    # Paper §6.3, with the clearance of the released experiment (SPEC §2).
+    # Paper §6.3, with the clearance of the released experiment (docs/method.md).
     "paper": {
         "start": (0.0, 0.0, 0.0, 0.0, 0.0),
         "goal": (2.2, 3.0, 0.0, 0.0, 0.0),

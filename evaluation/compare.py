@@ -1,4 +1,4 @@
-"""`compare` many controllers over the same Brownian paths (SPEC §7)."""
+"""`compare` many controllers over the same Brownian paths (docs/comparison.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured of an episode, and what `evaluate` says about many (SPEC §2, §7)."""
+"""What is measured of an episode, and what `evaluate` says about many (docs/comparison.md)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """How fast each method reaches an extremal: residual of the maximum principle at every iterate.
 
-The residual is the certificate's, of the non-linear problem (SPEC §3.7), so it means the same for
-every method: the paper's scheme, the same with shooting at its end (SPEC §3.8), Newton's method.
+The residual is the certificate's, of the non-linear problem (paper, Theorem 3.3), so it means the
+same for every method: the paper's scheme, the same with shooting at its end, Newton's method
+(docs/planner.md).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Intervals and errors: how far a Monte-Carlo number can be trusted (SPEC §7)."""
+"""Intervals and errors: how far a Monte-Carlo number can be trusted (docs/comparison.md)."""
 
 from __future__ import annotations
 

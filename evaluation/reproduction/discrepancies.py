@@ -1,4 +1,4 @@
-"""Where the text, what was released with it and this package differ, by numbers (SPEC §2)."""
+"""Where the text, what was released with it and this package differ, by numbers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Discrepancy:
 
 
 def discrepancies(r: ReproductionRecord) -> list[Discrepancy]:
-    """All of them, in the order of SPEC §2, and the stopping rule."""
+    """All of them, in the order of docs/reproduction.md, and the stopping rule."""
     return [*_cost(r), _covariance(r), *_search(r)]
 
 

@@ -1,8 +1,9 @@
 """What the paper's text says and what was released with it, each as something that can be run.
 
-SPEC §2 lists where §6 of the paper, the code released with it (StanfordASL/stochasticSCP) and this
-package differ. The pieces that are not options of `plan` are here: the potential as printed, the
-covariance steps of text and release, the start and the trust region of the release.
+docs/reproduction.md lists where §6 of the paper, the code released with it
+(StanfordASL/stochasticSCP) and this package differ. The pieces that are not options of `plan` are
+here: the potential as printed, the covariance steps of text and release, the start and the trust
+region of the release.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The configuration: SPEC §6's numbers, and what it refuses."""
+"""The configuration: the measured numbers, and what it refuses."""
 
 import dataclasses
 import json

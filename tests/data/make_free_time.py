@@ -7,7 +7,7 @@ The whole problem as one non-linear programme for IPOPT, the horizon T among its
     min over T, x, u   Σ dt ‖u_k‖² + Σ dt λ Σ_o max(0, c_o(r_{k+1}))² + c T,      dt = T/(N−1)
     s.t.   x_{k+1} = x_k + dt b(x_k, u_k),   x_0 = start,   x_{N−1} = goal,   |u| ≤ bound
 
-(SPEC §2; no noise, w = 0). Of the local optima found from several first T the file keeps the one
+(paper §6.3; no noise, w = 0). Of the local optima found from several first T the file keeps the one
 that the scenario's own guess leads to with T as the scenario has it; the others are listed. Each
 is checked by the definitions of slipcar.envs, and by plans with T fixed on both sides of T*.
 

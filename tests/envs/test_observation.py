@@ -121,7 +121,7 @@ def test_states_that_float32_cannot_tell_apart_are_refused():
 
 
 def test_features_by_hand():
-    """SPEC §5, one entry after the other."""
+    """The table of docs/slipcar-v0.md, one entry after the other."""
     t, x = 4.0, np.array([1.2, 2.5, math.pi / 6, 0.4, -0.3])
     to_go = np.array([1.0, 0.5, -math.pi / 6, 0.4, -0.3])  # T − t = 1 s
     expected = [

@@ -103,7 +103,7 @@ def test_the_named_scenarios():
 
 
 def test_the_papers_numbers():
-    """SPEC §2."""
+    """Paper §6.3, with the clearance of the released experiment."""
     assert (PAPER.horizon, PAPER.nodes, PAPER.dt) == (5.0, 41, 0.125)
     assert (PAPER.clearance, PAPER.obstacle_weight) == (0.13, 500.0)
     np.testing.assert_array_equal(PAPER.slip, [0.1, 0.01])

@@ -1,4 +1,4 @@
-"""The paper's case, planned and driven: numbers that were measured elsewhere (SPEC §4, §6)."""
+"""The paper's case, planned and driven: numbers that were measured elsewhere than here."""
 
 import numpy as np
 import pytest

@@ -79,7 +79,7 @@ def test_plans_are_made_as_is_said(done, space):
 
 
 def test_the_known_discrepancies_in_numbers(done):
-    """SPEC §2, as far as so few paths can tell."""
+    """docs/reproduction.md, as far as so few paths can tell."""
     rate = {name: run.result.collision_rate for name, run in done.runs.items()}
     assert rate["clearance 0.1, w = 0"] == pytest.approx(0.110, abs=0.015)
     assert rate["w = 0"] == pytest.approx(0.0596, abs=0.012)

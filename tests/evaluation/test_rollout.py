@@ -48,7 +48,7 @@ def test_heading_variance_of_a_circle_is_that_of_brownian_motion(replay):
 
 
 def test_agrees_with_one_path_written_out(paper, replay, turning):
-    """Physics and cost of SPEC §2, one episode at a time, without slipcar.envs."""
+    """Physics and cost of docs/method.md, one episode at a time, without slipcar.envs."""
     episode, seed = BLOCK + 7, 11
     noise = np.stack([step[7, 0] for step in block_noise(seed, 1, paper)])
     dt, (alpha2, beta2) = 0.125, (0.1, 0.01)

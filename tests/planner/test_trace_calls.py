@@ -337,7 +337,7 @@ def test_every_entry_of_a_result_is_an_expression():
         assert y.shape == np.shape(f(np.zeros((1, 3))))
 
 
-#: ../shared/reference/cases.py: what a drift may use.
+#: What a drift may use.
 DRAG = {
     "arctan2": lambda v, x: np.arctan2(v, 1.0 + x * x),
     "hypot": lambda v, x: np.hypot(v, 1.0) - 1.0,
