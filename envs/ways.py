@@ -64,8 +64,12 @@ def ways(scenario: Task, count: int) -> list[Way]:
     centres = scenario.obstacles[:, :2]
     reach = scenario.obstacles[:, 2] + scenario.clearance
     base, stiffness = cubic(scenario), _stiffness(scenario, reach)
-    number, finished, nearly = itertools.count(), {}, {}
-    heap = [(0.0, next(number), (), Way(base, 0.0, {}))]
+    number = itertools.count()
+    finished: dict[tuple[int, ...], Way] = {}
+    nearly: dict[tuple[int, ...], Way] = {}
+    heap: list[tuple[float, int, tuple[_Row, ...], Way]] = [
+        (0.0, next(number), (), Way(base, 0.0, {}))
+    ]
     for _ in range(_LOOKS):
         if not heap or len(finished) == count:
             break
@@ -84,9 +88,8 @@ def ways(scenario: Task, count: int) -> list[Way]:
             path, cost = _bent(base, pushed)
             new = Way(path, cost, {**way.sides, worst: side})
             heapq.heappush(heap, (cost, next(number), pushed, new))
-    return list(
-        (finished | {kind: nearly[kind] for kind in nearly if kind not in finished}).values()
-    )[:count]
+    rest = [way for kind, way in nearly.items() if kind not in finished]
+    return [*finished.values(), *rest][:count]
 
 
 def cubic(scenario: Task) -> Array:

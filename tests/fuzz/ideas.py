@@ -22,8 +22,8 @@ from . import damage, ipopt, judge, options, worlds
 from .calls import call
 from .problems import Own, Recipe, recipes
 
-#: Options of the convex method: it and its solvers take a problem in the units that it has.
-_CONVEX = {"method", "solver", "trust_region", "linearization", "shooting", "terminal_tolerance"}
+#: Options whose numbers, or whose packages, take a problem in the units that it has.
+_CONVEX = {"solver", "trust_region", "linearization", "shooting", "terminal_tolerance"}
 #: Options whose numbers have units: in others they ask for something else.
 _DIMENSIONAL = {
     "variance_weight", "terminal_weight", "time_weight", "risk_price", "free_final_time",
@@ -97,7 +97,10 @@ def judged(problem: Any, p: Plan) -> list[str]:
         tolerance = float(np.sqrt(p.options["tolerance"]))
         certificate = call(lambda: certify(p, tolerance=tolerance))
         found += certificate.findings
-        if certificate.error is None and not certificate.value.extremal:
+        # More conditions than controls, met all the same: multipliers are not unique, and the one
+        # of the cost may be as small as rounding makes it.
+        degenerate = len(p.multipliers.terminal) > p.controls.size
+        if certificate.error is None and not (certificate.value.extremal or degenerate):
             found.append(f"CONVERGED, but {str(certificate.value).splitlines()[0]}")
     return found + _kept(p)
 
