@@ -16,6 +16,7 @@ import numpy as np
 from slipcar.envs import Scenario
 from slipcar.envs.validate import checked_int
 from slipcar.evaluation.live.policies import policy_names
+from slipcar.planner.problem.model import model_of
 from slipcar.planner.problem.reposed import reposed
 
 #: Mode -> what the page calls it.
@@ -140,11 +141,15 @@ def plane_of(problem: Any) -> tuple[int, int]:
     """Which two components of the state are drawn.
 
     Raises:
-        ValueError: if the problem has no attribute `plane` that says so.
+        ValueError: if the problem has no attribute `plane` that says so, or is no problem.
     """
     if isinstance(problem, Scenario):
         return 0, 1
-    plane, n = getattr(problem, "plane", None), len(problem.start)
+    try:
+        n = model_of(problem).state_dim
+    except TypeError as error:  # it lacks what a problem has
+        raise ValueError(str(error)) from error
+    plane = getattr(problem, "plane", None)
     good = isinstance(plane, tuple) and len(plane) == 2 and plane[0] != plane[1]
     if not good or not all(isinstance(i, int) and 0 <= i < n for i in plane):
         raise ValueError(

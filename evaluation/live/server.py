@@ -72,7 +72,11 @@ def application(first: Scenario, systems: Mapping[str, Any], *, loopback: bool) 
         app.router.add_get(path, _file(name, kind))
     workers = ThreadPoolExecutor(2, thread_name_prefix="live")
     hello = json.dumps(_hello(first, systems))
-    app.router.add_get("/socket", lambda request: _tab(request, hello, systems, workers))
+
+    async def tab(request: web.Request) -> web.WebSocketResponse:
+        return await _tab(request, hello, systems, workers)
+
+    app.router.add_get("/socket", tab)
 
     async def close(_: web.Application) -> None:
         workers.shutdown(wait=False, cancel_futures=True)
@@ -169,7 +173,7 @@ class Tab:
             if isinstance(asked, Request):
                 return self._pictured(asked).to_bytes(number)
             error: Exception = asked
-        except (ValueError, TypeError, ArithmeticError) as refused:
+        except (ValueError, TypeError, ArithmeticError, RecursionError) as refused:
             error = refused
         facts = {"error": " ".join(str(error).split()) or type(error).__name__}
         return Picture(facts, {}).to_bytes(number)

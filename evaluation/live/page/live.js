@@ -248,6 +248,7 @@ function begun() {
     $("modes").append(label);
   }
   for (const name of hello.policies) $("policy").append(new Option(name, name));
+  $("policy").onchange = (e) => { remember(); state.policy = $("policy").value; changed(e); };
   for (const [name, [, set]] of Object.entries(sliders)) {
     $(name).onpointerdown = remember;
     $(name).onkeydown = (e) => { if (e.key.startsWith("Arrow")) remember(); };
