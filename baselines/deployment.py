@@ -88,9 +88,11 @@ def export_policy(
     t, x = (torch.tensor(a[:2], dtype=dtype) for a in _cases(world))
     about = json.dumps(
         {
-            "slipcar": 1, "fingerprint": policy.fingerprint(), "scenario": world.to_dict(),
+            "slipcar": 1,
+            "fingerprint": policy.fingerprint(),
+            "scenario": world.to_dict(),
             "observation": list(policy.layout.entries),
-        }  # fmt: skip
+        }
     )
     with warnings.catch_warnings():
         # Of branches on sizes, which the world fixes, and of the exporter's own age.

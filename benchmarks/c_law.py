@@ -62,7 +62,9 @@ def row(name: str, compiler: str) -> dict[str, Any]:
         seconds, got = in_c(law, t, x, real, compiler)
         cells[f"{word} [µs]"] = 1e6 * seconds
         expected = np.array([feedback.control(*case) for case in zip(t, x, strict=True)])
-        cells[f"{word}: difference"] = float((np.abs(got - expected) / (1 + np.abs(expected))).max())
+        cells[f"{word}: difference"] = float(
+            (np.abs(got - expected) / (1 + np.abs(expected))).max()
+        )
     began = time.perf_counter()
     for case in zip(t, x, strict=True):
         feedback.control(*case)

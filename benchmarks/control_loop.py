@@ -51,9 +51,7 @@ def section(steps: int = STEPS) -> Section:
     )
 
 
-def latencies(
-    steps: int, deadline: float | None
-) -> tuple[np.ndarray, np.ndarray, RecedingHorizon]:
+def latencies(steps: int, deadline: float | None) -> tuple[np.ndarray, np.ndarray, RecedingHorizon]:
     """Seconds of each step by the clock and by the processor, and the controller.
 
     The first episode's are left out.

@@ -1,6 +1,6 @@
 """The live page in Chromium on this machine: updates a second while dragging, input to picture.
 
-    python benchmarks/live_page.py picture docs/live.png      the picture in the docs
+python benchmarks/live_page.py picture docs/live.png      the picture in the docs
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def opened(world: str, **options: Any) -> Iterator[Any]:
 def picture(path: Path) -> None:
     """What the page looks like in the middle of a drag."""
     with opened("paper") as page:
-        page.select_option("#policy", "PPO, trained on the paper's world")
+        page.click("text=open loop")
         dragged(page, 2.0)
         page.wait_for_timeout(500)
         page.screenshot(path=path)

@@ -188,7 +188,8 @@ int main(void)
             largest = off > largest ? off : -off > largest ? -off : largest;
         }
     }
-    printf("%d cases, largest difference per 1 + |u|: %.3g (allowed: @tolerance@)\\n", CASES, largest);
+    printf("%d cases, largest difference per 1 + |u|: %.3g (allowed: @tolerance@)\\n", CASES,
+           largest);
     return largest <= @tolerance@ ? 0 : 1;
 }
 """

@@ -96,14 +96,14 @@ class Law:
 
     def control(self, t: float, x: Array) -> Array:
         """Controls (..., m) at a time [s] for states (..., n)."""
-        k = np.searchsorted(self.times, t + self.slack, side="right") - 1
-        k = int(np.clip(k, 0, len(self.controls) - 1))
+        begun = np.searchsorted(self.times, t + self.slack, side="right")
+        k = min(max(int(begun) - 1, 0), len(self.controls) - 1)
         error = wrap(np.asarray(x, dtype=np.float64) - self.mean[k], self.angles)
         u = self.controls[k] + applied(self.gains[k], error)
         return project_controls(u, self.lower, self.upper, self.radius)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON, where None is no bound; :meth:`from_dict` gives back an equal law."""
+        """Plain data for JSON, None where there is no bound; :meth:`from_dict` reads it."""
         data = {name: np.asarray(value).tolist() for name, value in vars(self).items()}
         for name in ("lower", "upper"):
             data[name] = [value if np.isfinite(value) else None for value in data[name]]

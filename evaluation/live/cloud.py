@@ -59,7 +59,7 @@ def violated(problem: Any, states: np.ndarray) -> np.ndarray | None:
     times = np.broadcast_to(problem.times[1:], states[:, 1:].shape[:2])
     with np.errstate(all="ignore"):
         broken = ~(np.asarray(constraint(times, states[:, 1:])) <= 0.0)  # NaN is a violation
-    return broken.any(axis=(1, 2))
+    return np.asarray(broken.any(axis=(1, 2)))
 
 
 @functools.lru_cache(maxsize=16)

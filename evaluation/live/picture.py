@@ -118,10 +118,10 @@ def numbers(planned: Plan) -> dict[str, Any]:
     return found
 
 
-def ellipses(mean: np.ndarray, covariance: np.ndarray, plane: list[int]) -> np.ndarray:
+def ellipses(mean: np.ndarray, covariance: Any, plane: list[int]) -> np.ndarray:
     """Rows x, y, semi-axes and angle [rad] of 95 % ellipses at some nodes, (k, 5)."""
     nodes = np.unique(np.linspace(1, len(mean) - 1, _ELLIPSES).astype(int))
-    S = covariance[np.ix_(nodes, plane, plane)]
+    S = covariance[nodes][:, plane][:, :, plane]
     if not np.isfinite(S).all():
         return np.empty((0, 5))
     values, vectors = np.linalg.eigh(S)

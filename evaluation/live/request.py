@@ -133,7 +133,9 @@ def checked_scenario(world: Mapping[str, Any]) -> Scenario:
         if (np.abs(values) > LARGEST).any():
             raise ValueError(f"{name}: numbers must be within ±{LARGEST:g} on this page")
     if not 0.1 <= scenario.horizon <= 100.0:
-        raise ValueError(f"horizon must be from 0.1 to 100 s on this page, not {scenario.horizon:g}")
+        raise ValueError(
+            f"horizon must be from 0.1 to 100 s on this page, not {scenario.horizon:g}"
+        )
     return scenario
 
 
@@ -149,14 +151,14 @@ def plane_of(problem: Any) -> tuple[int, int]:
         n = model_of(problem).state_dim
     except TypeError as error:  # it lacks what a problem has
         raise ValueError(str(error)) from error
-    plane = getattr(problem, "plane", None)
+    plane: Any = getattr(problem, "plane", None)
     good = isinstance(plane, tuple) and len(plane) == 2 and plane[0] != plane[1]
     if not good or not all(isinstance(i, int) and 0 <= i < n for i in plane):
         raise ValueError(
             f"{type(problem).__name__}.plane must be two different components of its {n} states "
             f"such as (0, 1), which the page draws, not {plane!r}"
         )
-    return plane
+    return plane[0], plane[1]
 
 
 def moved(problem: Any, world: Mapping[str, Any]) -> Any:

@@ -33,7 +33,15 @@ from slipcar.evaluation.own.digest import behaviour_digest
 if TYPE_CHECKING:
     from slipcar.planner import Plan
 
-__all__ = ["GROUP", "OwnMaker", "entry_points", "load_controller", "load_maker", "load_object", "split_name"]
+__all__ = [
+    "GROUP",
+    "OwnMaker",
+    "entry_points",
+    "load_controller",
+    "load_maker",
+    "load_object",
+    "split_name",
+]
 
 #: Entry points of this group are controllers by name.
 GROUP = "slipcar.controllers"

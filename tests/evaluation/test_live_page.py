@@ -262,7 +262,7 @@ def test_a_system_of_ones_own_is_dragged_in_its_plane(tab):
 
 
 def test_a_tab_that_goes_away_in_a_drag_leaves_a_server_that_serves_and_rests(tab, server):
-    address, process = server
+    process = server[1]
     page = tab()
     drag(page, "obstacles[0]", -60, 40, drop=False)
     page.close()

@@ -54,7 +54,7 @@ def test_a_deadline_that_cannot_be_kept_plays_the_feedback_law(controller):
 
 def test_headings_are_known_modulo_a_turn(controller):
     x = states(controller)[1]
-    turned = x + [0, 0, 2 * np.pi, 0, 0]
+    turned = x + 2 * np.pi * np.eye(5)[2]
     for deadline in (None, 1e-9):
         one, two = RecedingHorizon(PAPER), RecedingHorizon(PAPER)
         a = one.step(x, PAPER.times[1], deadline=deadline)
@@ -79,9 +79,7 @@ def test_what_is_underway_can_be_previewed(controller):
 def test_another_process_begins_an_episode_of_its_own(controller):
     x = states(controller)[1]
     u = controller.step(x, PAPER.times[1], deadline=10.0)
-    np.testing.assert_array_equal(
-        pickle.loads(pickle.dumps(controller)).step(x, PAPER.times[1]), u
-    )
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(controller)).step(x, PAPER.times[1]), u)
 
 
 @pytest.mark.parametrize(

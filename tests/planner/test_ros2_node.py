@@ -93,7 +93,8 @@ def test_the_node_hears_odometry_and_writes_speeds(example, pilot, monkeypatch):
     rclpy = ModuleType("rclpy")
     rclpy.init, rclpy.create_node, rclpy.spin = (lambda: None), (lambda name: node), spin
     modules = {"rclpy": rclpy}
-    for package, name, kind in (("geometry_msgs", "Twist", Twist), ("nav_msgs", "Odometry", object)):
+    kinds = ("geometry_msgs", "Twist", Twist), ("nav_msgs", "Odometry", object)
+    for package, name, kind in kinds:
         messages = ModuleType(f"{package}.msg")
         setattr(messages, name, kind)
         modules |= {package: ModuleType(package), f"{package}.msg": messages}

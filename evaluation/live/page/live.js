@@ -236,9 +236,12 @@ function controls() {
 }
 
 function begun() {
-  const worlds = [["the first one", hello.first], ...Object.entries(hello.scenarios)];
-  $("world").replaceChildren(...worlds.map(([name]) => new Option(name, name)),
+  const same = (world) => JSON.stringify(world) === JSON.stringify(hello.first);
+  const first = Object.keys(hello.scenarios).find((name) => same(hello.scenarios[name]));
+  const names = [...(first ? [] : ["the first one"]), ...Object.keys(hello.scenarios)];
+  $("world").replaceChildren(...names.map((name) => new Option(name, name)),
     ...Object.keys(hello.systems).map((name) => new Option(name, `system:${name}`)));
+  $("world").value = first || "the first one";
   $("world").onchange = () => choose($("world").value);
   for (const [mode, name] of Object.entries(hello.modes)) {
     const label = document.createElement("label"), input = document.createElement("input");
