@@ -4,16 +4,17 @@
                                      not there      ->  play the last good one, count it, and
                                                         take the better one over when it comes
 
-The slow part runs in a thread of its own, one request at a time. Machine code lets other threads
-run meanwhile; Python code does not always, and then the wait is up to an interval of the
-interpreter's longer (`sys.setswitchinterval`, 5 ms by default).
+The slow part runs in a thread of its own, one request at a time. Threads of Python take turns, by
+default of 5 ms; while a deadline runs, of a tenth of it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYetError
 from typing import Generic, TypeVar
@@ -22,6 +23,32 @@ import numpy as np
 
 Array = np.ndarray
 State = TypeVar("State")
+
+
+class _Turns:
+    """How long a thread of Python runs before another may: shorter while anyone asks for it."""
+
+    def __init__(self) -> None:
+        self._lock, self._asked, self._usual = threading.Lock(), 0, 0.0
+
+    @contextlib.contextmanager
+    def of(self, seconds: float) -> Iterator[None]:
+        """Turns of at most so many seconds."""
+        with self._lock:
+            if self._asked == 0:
+                self._usual = sys.getswitchinterval()
+            self._asked += 1
+            sys.setswitchinterval(max(min(sys.getswitchinterval(), seconds), 1e-6))
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._asked -= 1
+                if self._asked == 0:
+                    sys.setswitchinterval(self._usual)
+
+
+_TURNS = _Turns()
 
 
 class ControlLoop(Generic[State]):
@@ -72,7 +99,7 @@ class ControlLoop(Generic[State]):
         if self._asked is None:
             self._thread = self._thread or ThreadPoolExecutor(1, thread_name_prefix="replan")
             self._asked = self._thread.submit(self._renew, self.state, x, interval)
-            with contextlib.suppress(NotYetError):
+            with contextlib.suppress(NotYetError), _TURNS.of(0.1 * deadline):
                 left = deadline - (time.perf_counter() - began)
                 u, self.state = self._asked.result(max(left, 0.0))
                 self._asked = None

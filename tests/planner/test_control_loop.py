@@ -1,6 +1,7 @@
 """`RecedingHorizon.step`: one episode in a control loop, with a deadline and without."""
 
 import pickle
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -18,6 +19,18 @@ PAPER = Scenario.named("paper")
 @pytest.fixture
 def controller():
     return RecedingHorizon(PAPER)
+
+
+def busy(controller):
+    """The same with replans that take a while."""
+    renewed = controller._renewed
+
+    def slowly(*arguments):
+        time.sleep(0.2)
+        return renewed(*arguments)
+
+    controller._renewed = slowly
+    return controller
 
 
 def states(controller, seed=0):
@@ -45,7 +58,7 @@ def test_a_generous_deadline_changes_nothing(controller):
 
 def test_a_deadline_that_cannot_be_kept_plays_the_feedback_law(controller):
     x = states(controller)[1]
-    u = controller.step(x, PAPER.times[1], deadline=1e-9)
+    u = busy(controller).step(x, PAPER.times[1], deadline=1e-3)
     p = controller.plan
     law = p.controls[1] + p.gains[1] @ (x - p.mean[1])
     np.testing.assert_allclose(u, np.clip(law, -PAPER.control_bounds, PAPER.control_bounds))
@@ -55,8 +68,8 @@ def test_a_deadline_that_cannot_be_kept_plays_the_feedback_law(controller):
 def test_headings_are_known_modulo_a_turn(controller):
     x = states(controller)[1]
     turned = x + 2 * np.pi * np.eye(5)[2]
-    for deadline in (None, 1e-9):
-        one, two = RecedingHorizon(PAPER), RecedingHorizon(PAPER)
+    for deadline in (None, 1e-3):
+        one, two = (busy(RecedingHorizon(PAPER)) for _ in range(2))
         a = one.step(x, PAPER.times[1], deadline=deadline)
         np.testing.assert_allclose(two.step(turned, PAPER.times[1], deadline=deadline), a)
 
@@ -127,6 +140,12 @@ def test_the_last_good_law_goes_on_while_the_solver_is_busy(slow):
         assert slow.loop.step(np.zeros(1), k, 1e-3) == [0.0]
     assert slow.loop.late == 4
     assert slow.asked == [0]  # one request at a time
+
+
+def test_turns_of_threads_are_as_before_afterwards(slow):
+    before = sys.getswitchinterval()
+    slow.loop.step(np.zeros(1), 0, 1e-3)
+    assert sys.getswitchinterval() == before
 
 
 def test_a_late_answer_serves_the_steps_to_come(slow):
