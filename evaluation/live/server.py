@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import importlib.resources
 import json
+import signal
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -73,14 +74,29 @@ def application(first: Scenario, systems: Mapping[str, Any], *, loopback: bool) 
     workers = ThreadPoolExecutor(2, thread_name_prefix="live")
     hello = json.dumps(_hello(first, systems))
 
+    tabs: set[web.WebSocketResponse] = set()
+
     async def tab(request: web.Request) -> web.WebSocketResponse:
-        return await _tab(request, hello, systems, workers)
+        socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)
+        await socket.prepare(request)
+        tabs.add(socket)
+        try:
+            await socket.send_str(hello)
+            await _answer(socket, Tab(systems), workers)
+        finally:
+            tabs.discard(socket)
+        return socket
 
     app.router.add_get("/socket", tab)
+
+    async def hang_up(_: web.Application) -> None:
+        for socket in list(tabs):
+            await socket.close()
 
     async def close(_: web.Application) -> None:
         workers.shutdown(wait=False, cancel_futures=True)
 
+    app.on_shutdown.append(hang_up)
     app.on_cleanup.append(close)
     return app
 
@@ -129,13 +145,9 @@ def _hello(first: Scenario, systems: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-async def _tab(
-    request: web.Request, hello: str, systems: Mapping[str, Any], workers: ThreadPoolExecutor
-) -> web.WebSocketResponse:
-    socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)
-    await socket.prepare(request)
-    await socket.send_str(hello)
-    tab, tasks = Tab(systems), set()
+async def _answer(socket: web.WebSocketResponse, tab: Tab, workers: ThreadPoolExecutor) -> None:
+    """Answer what arrives until the tab goes away."""
+    tasks: set[asyncio.Task[None]] = set()
     async for message in socket:
         if message.type is not WSMsgType.TEXT:
             break
@@ -146,7 +158,6 @@ async def _tab(
             break
     for task in tasks:
         task.cancel()
-    return socket
 
 
 async def _reply(
@@ -192,12 +203,15 @@ class Tab:
 
 
 async def serve(app: web.Application, host: str, port: int, ready: Any) -> None:
-    """Serve until cancelled; `ready` is called with the page's address once it can be opened.
+    """Serve until interrupted; `ready` is called with the page's address once it can be opened.
 
     Raises:
         OSError: if the port is taken or the address is not this machine's, saying so.
     """
-    runner = web.AppRunner(app, access_log=None, handle_signals=True)
+    runner, interrupted = web.AppRunner(app, access_log=None), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with contextlib.suppress(NotImplementedError):  # on Windows Ctrl-C raises
+            asyncio.get_running_loop().add_signal_handler(number, interrupted.set)
     await runner.setup()
     try:
         try:
@@ -209,6 +223,6 @@ async def serve(app: web.Application, host: str, port: int, ready: Any) -> None:
             ) from error
         bound = runner.addresses[0][1]
         ready(f"http://{f'[{host}]' if ':' in host else host}:{bound}/")
-        await asyncio.Event().wait()
+        await interrupted.wait()
     finally:
         await runner.cleanup()

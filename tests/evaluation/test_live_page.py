@@ -34,8 +34,8 @@ def server():
         raise RuntimeError(line + process.stdout.read())
     yield line.split()[0], process
     process.terminate()
-    process.wait(20)
-    assert "Traceback" not in process.stdout.read()
+    assert process.wait(20) == 0
+    assert process.stdout.read() == ""
 
 
 @pytest.fixture(scope="module")
