@@ -130,6 +130,7 @@ def picture(path: Path) -> None:
         page.click("text=open loop")
         dragged(page, 2.0)
         page.wait_for_timeout(500)
+        page.evaluate("document.activeElement.blur()")
         page.screenshot(path=path)
 
 

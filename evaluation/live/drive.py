@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slipcar.envs import Scenario
-from slipcar.evaluation.live.picture import Picture, ellipses, numbers
+from slipcar.evaluation.live.picture import Picture, drawn, ellipses, numbers
 from slipcar.evaluation.live.request import Request
 from slipcar.planner import RecedingHorizon
 
@@ -74,20 +74,38 @@ class Drive:
         # The car's state is known from here on.
         return shorter.replace(start_deviation=0.0).reposed(start=self._trail[-1])
 
+    def _law(self, controller: RecedingHorizon, scenario: Scenario) -> Any:
+        """The latest plan's feedback law, from where the car is; t counts from there."""
+        begun = len(self._trail) - 1 - self._began
+        assert controller.underway is not None
+        x, u, gains = (controller.underway.plans[name][0] for name in ("x", "u", "gains"))
+
+        def control(t: float, states: np.ndarray) -> np.ndarray:
+            k = begun + round(t / scenario.dt)
+            played = u[k] + (states - x[k]) @ gains[k].T
+            bounds = scenario.control_bounds
+            return played if bounds is None else np.clip(played, -bounds, bounds)
+
+        return control
+
     def _picture(self, controller: RecedingHorizon, scenario: Scenario) -> Picture:
         mean, covariance = controller.preview(controller.underway)
+        ahead: dict[str, Any] = {"hits": None}
+        arrays: dict[str, Any] = {}
+        if not self.done:
+            rest = self._rest(scenario, len(self._trail) - 1)
+            ahead, arrays = drawn(rest, self._law(controller, scenario), _PLANE)
         trail = np.array(self._trail)
         off = np.abs(trail[-1] - scenario.goal)
         arrived = self.done and bool((off <= scenario.goal_tolerance).all())
-        facts = numbers(controller.plan) | {
+        facts = numbers(controller.plan) | ahead | {
             "drive": {
                 "done": self.done, "collided": self._collided, "arrived": arrived,
                 "off": float(np.hypot(*off[:2])), "step": len(trail) - 1, "steps": self._nodes - 1,
                 "dt": scenario.dt, "replans": controller.replans,
             },
-            "hits": None,
             "predicted": None,  # of a whole plan, from its own start
         }  # fmt: skip
-        arrays = {"mean": mean[:, _PLANE], "trail": trail[:, _PLANE]}
+        arrays |= {"mean": mean[:, _PLANE], "trail": trail[:, _PLANE]}
         arrays["ellipses"] = ellipses(mean, covariance, _PLANE)
         return Picture(facts, arrays)

@@ -167,6 +167,21 @@ def test_a_finger_drags_on_a_phone(tab):
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
+def test_an_obstacle_is_added_resized_and_removed_by_pointer(tab):
+    page = tab()
+    count = page.locator(".handle.obstacle").count()
+    page.click("text=Add an obstacle")
+    until(lambda: page.locator(".handle.obstacle").count() == count + 1)
+    drag(page, f"obstacles[{count}]", 120, 60)
+    for button in ("#larger", "#smaller"):
+        picture = shown(page)
+        page.click(button)
+        assert shown(page) != picture
+    page.click("#remove")
+    until(lambda: page.locator(".handle.obstacle").count() == count)
+    assert page.locator("#obstacle-row").is_hidden()
+
+
 def test_modes_differ_and_a_risk_is_verified(tab):
     page = tab()
     total = numbers(page)["total"]

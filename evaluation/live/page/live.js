@@ -154,6 +154,7 @@ function spots() {
 }
 
 function handles(focus = "") {
+  $("obstacle-row").hidden = true;
   const box = $("handles");
   box.replaceChildren(...spots().map((spot) => {
     const button = document.createElement("button");
@@ -162,12 +163,33 @@ function handles(focus = "") {
     button.dataset.key = spot.key;
     button.spot = spot;
     button.addEventListener("pointerdown", grab);
+    button.addEventListener("focus", () => chosen(spot));
     button.addEventListener("keydown", key);
     return button;
   }));
   place();
   if (focus) box.querySelector(`[data-key="${focus}"]`)?.focus();
 }
+
+// The obstacle that was touched last can be resized and removed without a keyboard.
+let obstacle = null;
+function chosen(spot) {
+  if (spot.kind !== "obstacle") return;
+  obstacle = spot;
+  $("obstacle-row").hidden = false;
+  $("obstacle-name").textContent = `Obstacle ${spot.index + 1}`;
+}
+function grow(spot, by, event) { remember(); spot.grow(by); changed(event); }
+function drop(spot, event) {
+  if (state.system !== hello.car) return;
+  remember();
+  state.world.obstacles.splice(spot.index, 1);
+  handles("goal");
+  changed(event);
+}
+$("smaller").onclick = (e) => grow(obstacle, -0.02, e);
+$("larger").onclick = (e) => grow(obstacle, 0.02, e);
+$("remove").onclick = (e) => drop(obstacle, e);
 
 function place() {
   for (const button of $("handles").children) {
@@ -184,7 +206,7 @@ function grab(event) {
   const button = event.currentTarget, box = $("stage").getBoundingClientRect();
   const [x, y] = toScreen(view, ...button.spot.get());
   const off = [event.clientX - box.left - x, event.clientY - box.top - y];
-  remember();
+  remember(); chosen(button.spot);
   button.setPointerCapture(event.pointerId);
   button.onpointermove = (e) => {
     button.spot.set(...toPlane(view, e.clientX - box.left - off[0], e.clientY - box.top - off[1]));
@@ -198,13 +220,10 @@ function key(event) {
   const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
   const [x, y] = spot.get();
   const grow = { "+": 0.02, "=": 0.02, "-": -0.02, "−": -0.02 }[event.key];
+  if (event.key === "Delete" && spot.kind === "obstacle") { drop(spot, event); return; }
   if (moves[event.key]) { remember(); spot.set(x + moves[event.key][0], y + moves[event.key][1]); }
   else if (grow && spot.grow) { remember(); spot.grow(grow); }
-  else if (event.key === "Delete" && spot.kind === "obstacle" && state.system === hello.car) {
-    remember();
-    state.world.obstacles.splice(spot.index, 1);
-    handles("goal");
-  } else return;
+  else return;
   event.preventDefault();
   changed(event);
 }
@@ -355,8 +374,9 @@ function stop() {
 
 // ------------------------------------------------------------------------------------- words
 
-const percent = (p) => `${Number((100 * p).toPrecision(3))} %`;
-const range = ([low, high]) => `[${percent(low)}, ${percent(high)}]`;
+const percent = (p) => `${digits(p)} %`;
+const digits = (p) => Number((100 * p).toPrecision(2));
+const range = (p, [low, high]) => `${digits(p)} [${digits(low)}, ${digits(high)}] %`;
 
 function numbers(f) {
   const rows = [];
@@ -365,12 +385,12 @@ function numbers(f) {
   rows.push(["total", costs.reduce((sum, [, v]) => sum + v, 0).toFixed(3)]);
   rows.push(["iterations", f.iterations]);
   if (f.predicted !== null) rows.push(["risk, predicted at most", percent(f.predicted)]);
-  if (f.hits !== null) rows.push([`risk, ${f.paths} paths`, `${percent(f.hits / f.paths)} ${range(f.interval)}`]);
+  if (f.hits !== null) rows.push([`risk${f.drive ? " from here" : ""}, ${f.paths} paths`, range(f.hits / f.paths, f.interval)]);
   if (f.verified) {
-    rows.push([`risk, ${f.verified.episodes} fresh paths`, `${percent(f.verified.rate)} ${range(f.verified.interval)}`]);
+    rows.push([`risk, ${f.verified.episodes} fresh paths`, range(f.verified.rate, f.verified.interval)]);
     rows.push(["price found", f.verified.price.toFixed(2)]);
   }
-  if (f.policy) rows.push([f.policy.name, `${percent(f.policy.hits / f.policy.paths)} ${range(f.policy.interval)}`]);
+  if (f.policy) rows.push([f.policy.name, range(f.policy.hits / f.policy.paths, f.policy.interval)]);
   if (f.plan_ms) rows.push(["planned in", `${f.plan_ms.toFixed(1)} ms`]);
   $("numbers").replaceChildren(...rows.flatMap(([name, value]) => {
     const dt = document.createElement("dt"), dd = document.createElement("dd");
@@ -434,7 +454,7 @@ function show(inputs) {
       for (const list of [measured.latencies, measured.drawn]) if (list.length > 5000) list.splice(0, 2500);
       const latest = measured.drawn.slice(-20);
       const rate = latest.length > 1 ? 1e3 * (latest.length - 1) / (latest.at(-1) - latest[0]) : 0;
-      if (now - latest[0] < 5000 && rate) {
+      if (now - latest[0] < 2000 && rate > 1) {
         $("speed").textContent = `${rate.toFixed(0)} updates a second; ` +
           `${measured.latencies.at(-1).toFixed(0)} ms from input to picture`;
       }
