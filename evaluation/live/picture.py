@@ -19,6 +19,7 @@ from slipcar.planner.search.risk import wilson_interval
 
 #: Fresh paths that verify a risk on the page; `slipcar plan --risk` takes 100 000.
 EPISODES = 20_000
+_QUICK = {"starts": 1, "max_iterations": 60}
 #: Ellipses drawn, at most.
 _ELLIPSES = 14
 
@@ -47,11 +48,14 @@ class Picture:
 
 def options_of(request: Request) -> dict[str, Any]:
     """What `plan` is called with; the page shows it as Python."""
-    if request.mode == "open":
-        return {"risk_price": request.price} if request.price else {"expected": True}
+    price = {"risk_price": request.price} if request.price else {}
     if request.mode == "risk" and request.verify:
         return {"feedback": True, "risk": request.risk, "risk_episodes": EPISODES}
-    return {"feedback": True, **({"risk_price": request.price} if request.price else {})}
+    if request.mode == "open":
+        options: dict[str, Any] = price or {"expected": True}
+    else:
+        options = {"feedback": True, **price}
+    return {**options, **(_QUICK if request.quick else {})}
 
 
 def picture(request: Request, problem: Any) -> Picture:
@@ -70,7 +74,8 @@ def picture(request: Request, problem: Any) -> Picture:
         "mean": planned.mean[:, plane],
         "ellipses": ellipses(planned.mean, planned.covariance, plane),
     }
-    facts |= {**numbers(planned), "plan_ms": 1e3 * planned_in, "python": python(request, problem)}
+    facts |= numbers(planned) | {"plan_ms": 1e3 * planned_in, "quick": request.quick}
+    facts["python"] = python(request, problem)
     if request.policy and isinstance(problem, Scenario):
         beside, learned = drawn(problem, driven_by(request.policy, problem), plane)
         facts["policy"] = {"name": request.policy, **beside}

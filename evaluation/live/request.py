@@ -47,6 +47,7 @@ class Request:
         risk: δ in (0, 1), for the mode `risk`.
         policy: the learned policy to show beside it; empty for none.
         verify: look for the price that keeps the risk δ, and verify it, which takes a second.
+        quick: one guess and few iterations, for hard worlds while one drags.
         begin: with the mode `drive`, begin at the start again.
         seed: ≥ 0, of the noise of a drive that begins.
 
@@ -61,6 +62,7 @@ class Request:
     risk: float = 0.01
     policy: str = ""
     verify: bool = False
+    quick: bool = False
     begin: bool = False
     seed: int = 0
 
@@ -71,7 +73,7 @@ class Request:
             raise ValueError(f"mode must be one of {list(MODES)}, not {self.mode!r}")
         if self.policy and self.policy not in policy_names():
             raise ValueError(f"policy must be one of {list(policy_names())}, not {self.policy!r}")
-        for name in ("verify", "begin"):
+        for name in ("verify", "quick", "begin"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be true or false, not {getattr(self, name)!r}")
         checked_int("seed", self.seed, at_least=0)

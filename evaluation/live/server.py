@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import importlib.resources
 import json
+import logging
 import signal
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -45,6 +46,7 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
+_log = logging.getLogger(__name__)
 #: Bytes of a request, at most.
 _LONGEST = 64 * 1024
 
@@ -186,6 +188,9 @@ class Tab:
             error: Exception = asked
         except (ValueError, TypeError, ArithmeticError, RecursionError) as refused:
             error = refused
+        except Exception:  # the page goes on, and whoever runs the server is told
+            _log.exception("a request failed")
+            error = RuntimeError("the server failed: its terminal says how")
         facts = {"error": " ".join(str(error).split()) or type(error).__name__}
         return Picture(facts, {}).to_bytes(number)
 

@@ -292,3 +292,42 @@ def test_a_tab_that_goes_away_in_a_drag_leaves_a_server_that_serves_and_rests(ta
         before = used()
         time.sleep(2.0)
         assert used() - before < 0.1  # seconds of the processor in two: it rests
+
+
+def test_a_hard_world_is_dragged_by_quick_plans_and_planned_whole_at_rest(tab):
+    page = tab()
+    page.evaluate("document.getElementById('horizon').value = 1")  # hardly time to get there
+    page.locator("#horizon").dispatch_event("input")
+    page.select_option("#world", "slalom")
+    page.click("text=open loop")
+    for _ in range(3):
+        drag(page, "obstacles[1]", -30, 20)
+    page.wait_for_timeout(1500)
+    until(lambda: "planning" not in page.inner_text("#status"))
+    page.click("text=Python")
+    assert "starts=1" not in page.input_value("#text")
+
+
+def test_a_server_that_comes_back_is_found_again(browser):
+    def started(port):
+        command = [sys.executable, "-m", "slipcar.evaluation", "live", "--port", str(port)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, bufsize=1)
+        return process, process.stdout.readline().split()[0]
+
+    process, address = started(0)
+    page = browser.new_page()
+    try:
+        page.goto(address)
+        page.wait_for_selector("#numbers dd")
+        process.terminate()
+        process.wait(20)
+        until(lambda: "does not answer" in page.inner_text("#banner"))
+        process, _ = started(address.rstrip("/").rpartition(":")[2])
+        total = numbers(page)["total"]
+        drag(page, "obstacles[0]", -60, 40)
+        other_than(page, total)
+        assert page.locator("#banner").is_hidden()
+    finally:
+        page.close()
+        process.terminate()
+        process.wait(20)

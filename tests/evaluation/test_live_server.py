@@ -48,6 +48,13 @@ def test_a_picture_is_the_plan_and_its_paths():
     assert sum(header["cost"].values()) == pytest.approx(p.expected.total)
 
 
+def test_a_quick_plan_says_so_and_how():
+    header, _ = asked(quick=True)
+    assert header["quick"]
+    assert "starts=1" in header["python"]
+    assert not asked()[0]["quick"]
+
+
 def test_paths_have_the_spread_of_the_covariance():
     p = plan(PAPER, feedback=True)
     states = cloud(PAPER, Feedback(p).control, 20_000)
@@ -79,6 +86,7 @@ def test_paths_that_leave_the_numbers_count_as_collisions():
         ({"price": -1.0}, "price must be between"),
         ({"price": "1"}, "price must be between"),
         ({"risk": 1.5}, "risk must be between"),
+        ({"quick": None}, "quick must be true or false"),
         ({"verify": 1}, "verify must be true or false"),
         ({"file": "x"}, "nothing like ['file']"),
     ],

@@ -7,7 +7,7 @@ const $ = (id) => document.getElementById(id);
 const copy = (value) => JSON.parse(JSON.stringify(value));
 let hello, socket, state, view, picture = null, stale = false;
 let busy = false, wanted = false, number = 0, begin = false;
-let driving = null, verifying = 0, rest = null, riskPrice = 0, drawing = false;
+let driving = null, verifying = 0, verifies = "", rest = null, riskPrice = 0, drawing = false;
 const undo = [];
 // When inputs arrived that no request has, that the request under way has, and that were drawn.
 let waiting = [], sent = [];
@@ -42,13 +42,18 @@ function request(extra = {}) {
     price: mode === "risk" ? riskPrice : price, ...extra });
 }
 
+// Milliseconds of planning beyond which drags are answered by quick plans, the whole at rest.
+const SLOW = 60;
+let slow = false, waits = null;
+
 function ask() {
   if (!socket || socket.readyState > 1) { connect(); return; }
   if (socket.readyState !== 1 || !hello) return;
   if (busy) { wanted = true; return; }
   busy = true; wanted = false;
   sent = waiting; waiting = [];
-  socket.send(request({ begin, seed: begin ? Math.floor(1e6 * Math.random()) : 0 }));
+  waits = setTimeout(() => { $("status").textContent = "planning …"; }, 400);
+  socket.send(request({ quick: slow && !driving, begin, seed: begin ? Math.floor(1e6 * Math.random()) : 0 }));
   begin = false;
 }
 
@@ -56,12 +61,15 @@ function answer(buffer) {
   const got = unpacked(buffer);
   if (got.facts.id === verifying) { verified(got); return; }
   busy = false;
+  clearTimeout(waits);
+  paced(got.facts);
   const inputs = sent;
   sent = [];
   if (wanted) ask();
   complain(got.facts.error || "");
   stale = Boolean(got.facts.error);
-  if (!stale) { picture = got; if (!state.verified) numbers(got.facts); }
+  if (got.facts.quick) { clearTimeout(rest); rest = setTimeout(verify, 400); }
+  if (!stale) { picture = got; numbers(got.facts); }
   if (driving) driven(got.facts);
   show(inputs);
 }
@@ -71,7 +79,6 @@ function answer(buffer) {
 // Something was changed; at the end of a drag `finished` keeps what was before for Undo.
 function changed(event) {
   waiting.push(event && event.timeStamp ? event.timeStamp : performance.now());
-  state.verified = null;
   clearTimeout(rest);
   if (state.mode === "risk") rest = setTimeout(verify, 400);
   place(); show([]); ask();
@@ -86,19 +93,26 @@ function remember() {
 
 function verify() {
   if (verifying || busy || socket.readyState !== 1) { rest = setTimeout(verify, 200); return; }
-  socket.send(request({ verify: true }));
+  const risk = state.mode === "risk";
+  socket.send(request({ verify: risk }));
   verifying = number;
-  measured.verifying = JSON.stringify(state);
-  $("status").textContent = "verifying the risk …";
+  verifies = JSON.stringify(state);
+  $("status").textContent = risk ? "verifying the risk …" : "planning thoroughly …";
+}
+
+// Whether whole plans of this world are too slow to drag by; a drag of another may be faster.
+function paced(facts) {
+  if (facts.plan_ms && !facts.quick) slow = facts.plan_ms > SLOW;
 }
 
 function verified(got) {
   verifying = 0;
+  if (state.mode !== "risk") paced(got.facts);
   if (got.facts.error) { complain(got.facts.error); return; }
   const { verified: found } = got.facts;
   if (found && Number.isFinite(found.price)) riskPrice = found.price;
-  if (measured.verifying !== JSON.stringify(state)) return;  // dragged on meanwhile
-  picture = got; state.verified = null;
+  if (verifies !== JSON.stringify(state)) return;  // dragged on meanwhile
+  picture = got;
   numbers(got.facts); show([]);
 }
 
@@ -334,9 +348,8 @@ addEventListener("focus", () => { if (socket && socket.readyState > 1) connect()
 
 for (const button of $("copies").querySelectorAll("button")) {
   button.onclick = async () => {
-    const { verified: _, ...plain } = state;
     const texts = {
-      link: `${location.origin}${location.pathname}#${encodeURIComponent(JSON.stringify(plain))}`,
+      link: `${location.origin}${location.pathname}#${encodeURIComponent(JSON.stringify(state))}`,
       json: JSON.stringify(state.world, null, 1),
       python: picture ? picture.facts.python || "" : "",
     };
