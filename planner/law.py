@@ -18,7 +18,8 @@ from slipcar.planner.controllers import Feedback, clock_slack
 from slipcar.planner.moments.gains import wrap
 from slipcar.planner.options import check_choice
 from slipcar.planner.plan import Plan
-from slipcar.planner.problem.control_set import project_controls
+from slipcar.planner.problem.control_set import control_ball, control_limits, project_controls
+from slipcar.planner.problem.numbers import finite
 from slipcar.planner.search.replanning import applied
 
 Array = np.ndarray
@@ -117,7 +118,7 @@ class Law:
         """The law that :meth:`as_dict` described.
 
         Raises:
-            ValueError: for another format, or missing entries.
+            ValueError: for another format, missing entries, or numbers that do not fit.
         """
         if (data.get("format"), data.get("version")) != (FORMAT, VERSION):
             known = f"format {FORMAT!r}, version {VERSION}"
@@ -128,14 +129,21 @@ class Law:
             fields = {field.name: data[field.name] for field in dataclasses.fields(cls)}
         except KeyError as missing:
             raise ValueError(f"a law has {missing.args[0]!r}, which is missing") from None
-        none = {"lower": -np.inf, "upper": np.inf}
-        for name, value in none.items():
-            fields[name] = [value if entry is None else entry for entry in fields[name]]
-        fields["radius"] = np.inf if fields["radius"] is None else fields["radius"]
-        fields["angles"] = tuple(fields["angles"])
-        scalars = ("radius", "slack", "angles")
-        arrays = {k: np.array(v, dtype=np.float64) for k, v in fields.items() if k not in scalars}
-        return cls(**{**fields, **arrays})
+        gains = finite("gains", fields["gains"], (None, None, None))
+        K, m, n = gains.shape
+        shapes = {"times": (K + 1,), "controls": (K, m), "mean": (K, n), "slack": ()}
+        fields |= {name: finite(name, fields[name], shape) for name, shape in shapes.items()}
+        bounds = [
+            [none if value is None else value for value in fields[name]]
+            for name, none in (("lower", -np.inf), ("upper", np.inf))
+        ]
+        lower, upper = control_limits(bounds, m)
+        limits = {"lower": lower, "upper": upper}
+        radius = control_ball(fields["radius"], lower, upper)
+        if any(not isinstance(i, int) or not 0 <= i < n for i in fields["angles"]):
+            raise ValueError(f"angles must be components of {n} states, not {fields['angles']}")
+        exact = {"gains": gains, "angles": tuple(fields["angles"]), "slack": float(fields["slack"])}
+        return cls(**{**fields, **limits, **exact, "radius": radius})
 
 
 def _actuation(plan: Plan) -> Actuation:

@@ -210,7 +210,16 @@ def test_what_cannot_be_exported_says_why(paper):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"version": 2}, "version 2"), ({"format": "x"}, "not a law"), ({"gains": None}, "'gains'")],
+    [
+        ({"version": 2}, "version 2"),
+        ({"format": "x"}, "not a law"),
+        ({"gains": None}, "'gains'"),
+        ({"mean": [[0.0] * 5]}, "mean must have shape \\(40, 5\\)"),
+        ({"times": [0.0] * 40 + ["x"]}, "times must be numbers"),
+        ({"angles": [5]}, "angles must be components of 5 states"),
+        ({"lower": [3.0, 0.0]}, "lower < upper"),
+        ({"radius": -1.0}, "control_radius"),
+    ],
 )
 def test_another_json_is_refused(paper, change, words):
     data = {**Law.of(paper).as_dict(), **change}
