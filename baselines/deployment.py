@@ -82,6 +82,8 @@ def export_policy(
     """
     if target not in TARGETS:
         raise ValueError(f"unknown target {target!r}; a policy is exported as {list(TARGETS)}")
+    if path.is_dir() or not path.parent.is_dir():
+        raise OSError(f"cannot write {path}: it must be a file in a folder that is there")
     world = policy.scenario if scenario is None else scenario
     dtype = torch.float32 if float32 else torch.float64
     module = Deployed(policy, world, dtype)
@@ -104,8 +106,9 @@ def export_policy(
             torch.jit.save(traced, str(path), _extra_files={"slipcar.json": about.encode()})
     off = _difference(policy, world, path, target, float32=float32)
     if off is not None and not off <= TOLERANCE[float32]:
+        path.unlink()
         raise ValueError(
-            f"{path} differs from the policy by {off:.3g} of the largest control, more than "
+            f"{path} would differ from the policy by {off:.3g} of the largest control, more than "
             f"{TOLERANCE[float32]:g}"
         )
     return off

@@ -58,6 +58,8 @@ def export(
             f"{' or '.join(_POLICIES)}: not {source} to {to}"
         )
     if stored:
+        if scenario is not None:
+            raise ValueError("--scenario is of policies; a plan knows its own")
         return _export_plan(Path(source), to, out, law, float32, unbounded)
     if law != "planned" or unbounded:
         raise ValueError("--law and --unbounded are of plans, not of policies")

@@ -79,7 +79,7 @@ def application(first: Scenario, systems: Mapping[str, Any], *, loopback: bool) 
     tabs: set[web.WebSocketResponse] = set()
 
     async def tab(request: web.Request) -> web.WebSocketResponse:
-        socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)
+        socket = web.WebSocketResponse(compress=False, max_msg_size=_LONGEST, heartbeat=30.0)
         await socket.prepare(request)
         tabs.add(socket)
         try:

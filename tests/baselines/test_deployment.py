@@ -93,6 +93,9 @@ def test_what_cannot_be_exported_says_why(tmp_path):
         export_policy(policy, tmp_path / "p", "c")
     with pytest.raises(ValueError, match="family of worlds"):
         export_policy(baselines.shipped_runs("ppo", "random")[0], tmp_path / "p.pt", "torchscript")
+    for bad in (tmp_path, tmp_path / "nowhere" / "p.pt"):
+        with pytest.raises(OSError, match="must be a file in a folder that is there"):
+            export_policy(policy, bad, "torchscript")
     free = policy.scenario.replace(control_bounds=None)
     with pytest.raises(ValueError, match="control_bounds is None"):
         export_policy(policy, tmp_path / "p.pt", "torchscript", free)
@@ -103,5 +106,6 @@ def test_what_cannot_be_exported_says_why(tmp_path):
 def test_a_file_that_answers_otherwise_is_not_passed_off(tmp_path, monkeypatch):
     policy = baselines.load_policy()
     monkeypatch.setattr(deployment, "TOLERANCE", {False: 0.0})
-    with pytest.raises(ValueError, match="differs from the policy"):
+    with pytest.raises(ValueError, match="would differ from the policy"):
         export_policy(policy, tmp_path / "p.pt", "torchscript")
+    assert not list(tmp_path.iterdir())

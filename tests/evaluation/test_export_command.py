@@ -46,6 +46,7 @@ def test_the_shipped_policy_becomes_torchscript(tmp_path, capsys):
         (["PLAN", "--to", "onnx"], "a plan (.npz) is exported to c or json"),
         (["policy", "--to", "c"], "a plan (.npz) is exported to c or json"),
         (["PLAN", "--to", "json", "--float32"], "--float32 is of C"),
+        (["PLAN", "--to", "c", "--scenario", "gap"], "--scenario is of policies"),
         (["policy", "--to", "onnx", "--law", "lqr"], "are of plans"),
         (["nowhere.npz", "--to", "c"], "no plan at nowhere.npz"),
         (["nowhere", "--to", "onnx"], "no weights at nowhere"),

@@ -12,7 +12,8 @@ const undo = [];
 // When inputs arrived that no request has, that the request under way has, and that were drawn.
 let waiting = [], sent = [];
 // For the benchmark: milliseconds from input to picture, and when pictures were drawn.
-const measured = { latencies: [], drawn: [], ready: false };
+const measured = { latencies: [], drawn: [],
+  get settled() { return !busy && !wanted && !verifying && !rest && !drawing && Boolean(picture); } };
 window.slipcarLive = measured;
 
 // ------------------------------------------------------------------------------------- socket
@@ -31,8 +32,8 @@ function connect() {
 
 function greet(told) {
   say("banner", "");
-  if (!hello) { hello = told; begun(); }
-  ask();
+  if (hello) ask();
+  else { hello = told; begun(); }
 }
 
 function request(extra = {}) {
@@ -80,8 +81,9 @@ function answer(buffer) {
 function changed(event) {
   waiting.push(event && event.timeStamp ? event.timeStamp : performance.now());
   clearTimeout(rest);
-  if (state.mode === "risk") rest = setTimeout(verify, 400);
-  place(); show([]); ask();
+  rest = state.mode === "risk" ? setTimeout(verify, 400) : null;
+  place(); show([]);
+  if (!driving) ask();  // the next tick takes it along
 }
 
 function remember() {
@@ -93,6 +95,7 @@ function remember() {
 
 function verify() {
   if (verifying || busy || socket.readyState !== 1) { rest = setTimeout(verify, 200); return; }
+  rest = null;
   const risk = state.mode === "risk";
   socket.send(request({ verify: risk }));
   verifying = number;
@@ -294,7 +297,6 @@ function begun() {
   fromLink();
   rebuild();
   undo.length = 0; controls();
-  measured.ready = true;
 }
 
 function choose(value) {
@@ -370,13 +372,15 @@ $("drive").onclick = () => {
 };
 
 function driven(facts) {
-  if (facts.error) { stop(); return; }
+  clearTimeout(driving.timer);
+  // The car waits while the world is one that cannot be planned for.
+  if (facts.error) { driving.timer = setTimeout(ask, 250); return; }
   const d = facts.drive;
   if (!d) { driving.timer = setTimeout(ask, 0); return; }  // an older answer
   $("drive-state").textContent = `step ${d.step} of ${d.steps}${d.collided ? ", collided" : ""}` +
     (d.done ? `; ${d.arrived ? "arrived" : "not arrived"}, ${d.off.toFixed(2)} m off` : "");
   if (d.done) stop();
-  else { clearTimeout(driving.timer); driving.timer = setTimeout(ask, 1e3 * d.dt); }
+  else driving.timer = setTimeout(ask, 1e3 * d.dt);
 }
 
 function stop() {
