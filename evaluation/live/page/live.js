@@ -12,7 +12,7 @@ const undo = [];
 // When inputs arrived that no request has, that the request under way has, and that were drawn.
 let waiting = [], sent = [];
 // For the benchmark: milliseconds from input to picture, and when pictures were drawn.
-const measured = { latencies: [], drawn: [],
+const measured = { latencies: [], drawn: [], answers: 0, quick: 0,
   get settled() { return !busy && !wanted && !verifying && !rest && !drawing && Boolean(picture); } };
 window.slipcarLive = measured;
 
@@ -64,12 +64,15 @@ function answer(buffer) {
   busy = false;
   clearTimeout(waits);
   paced(got.facts);
+  measured.answers += 1;
+  measured.quick += got.facts.quick ? 1 : 0;
   const inputs = sent;
   sent = [];
   if (wanted) ask();
   complain(got.facts.error || "");
   stale = Boolean(got.facts.error);
-  if (got.facts.quick) { clearTimeout(rest); rest = setTimeout(verify, 400); }
+  // A slow first plan may have compiled: whether whole plans are slow, the next one tells.
+  if (slow && !driving) { clearTimeout(rest); rest = setTimeout(verify, 400); }
   if (!stale) { picture = got; numbers(got.facts); }
   if (driving) driven(got.facts);
   show(inputs);
@@ -77,7 +80,7 @@ function answer(buffer) {
 
 // ------------------------------------------------------------------------------------- changes
 
-// Something was changed; at the end of a drag `finished` keeps what was before for Undo.
+// Something was changed; `remember` is called before, for Undo.
 function changed(event) {
   waiting.push(event && event.timeStamp ? event.timeStamp : performance.now());
   clearTimeout(rest);
@@ -94,6 +97,7 @@ function remember() {
 }
 
 function verify() {
+  if (driving) { rest = null; return; }
   if (verifying || busy || socket.readyState !== 1) { rest = setTimeout(verify, 200); return; }
   rest = null;
   const risk = state.mode === "risk";
