@@ -35,10 +35,14 @@ One process, one core (`OMP_NUM_THREADS=1`). A time of slipcar's is the whole ca
 problem that it has met before, a time of CasADi's the call of its solver on a programme that is
 built. What either believes of its answer is judged by the problem's own functions. Milliseconds
 belong to the machine; what carries over are ratios within a run."""
+_HOW_LIVE = """\
+The server, the browser and what drags share the machine's cores, and whatever else runs has its
+share; what is timed is said at each table. Milliseconds belong to the machine."""
 #: By page; `_HOW` elsewhere.
 _HOW_OF = {
     "benchmarks-environment.md": _HOW_ENVIRONMENT,
     "benchmarks-systems.md": _HOW_SYSTEMS,
+    "benchmarks-live.md": _HOW_LIVE,
 }
 
 

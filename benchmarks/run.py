@@ -12,9 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import c_law
 import cold
+import control_loop
 import environment
 import growth
+import live_page
 import page
 import peers
 import planners
@@ -29,7 +32,7 @@ import worlds
 
 PARTS = ("planners", "growth", "cold", "simulation", "environment", "risk_times")
 #: Minutes; on request.
-LONG_PARTS = ("worlds", "systems", "risk_paper", "risk")
+LONG_PARTS = ("worlds", "systems", "risk_paper", "risk", "live_page", "control_loop", "c_law")
 #: Pages of the docs: file, heading and parts.
 PAGES = (
     ("benchmarks.md", "Benchmarks", ("planners", "growth", "cold", "simulation", "worlds")),
@@ -39,6 +42,11 @@ PAGES = (
         ("risk_paper", "risk_times", "risk"),
     ),
     ("benchmarks-systems.md", "Benchmarks: users' systems", ("systems",)),
+    (
+        "benchmarks-live.md",
+        "Benchmarks: live page, control loop, C",
+        ("live_page", "control_loop", "c_law"),
+    ),
     ("benchmarks-environment.md", "Benchmarks: environment", ("environment",)),
 )
 
@@ -56,6 +64,9 @@ def main() -> None:
         "worlds": functools.partial(worlds.section, arguments.seeds, folder),
         "systems": functools.partial(systems.section.section, folder),
         "risk_paper": risk_paper.section,
+        "live_page": live_page.section,
+        "control_loop": control_loop.section,
+        "c_law": c_law.section,
         "risk": functools.partial(risk_worlds.section, arguments.risk_worlds, folder),
     }
     for part in arguments.only:

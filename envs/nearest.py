@@ -63,6 +63,8 @@ def _order_of_tensor(rims: Any) -> Any:
     """:func:`order_of` for Torch, (k, cars) int64: pointwise, so that a compiler can fuse it."""
     import torch
 
+    if torch.jit.is_tracing():  # for a file: other runtimes cannot look at a float's bits
+        return rims.detach().argsort(dim=0)
     count = len(rims)
     whole = {torch.float32: torch.int32, torch.float64: torch.int64}[rims.dtype]
     keys = rims.detach().contiguous().view(whole)

@@ -19,7 +19,9 @@ from slipcar.evaluation.terminal import speak_plainly
 COMMANDS = {
     "compare": "tables and figures: planners and policies, in suites of worlds",
     "dataset": "write episodes of any controller as a Minari dataset",
+    "export": "a plan as C or JSON, a policy as ONNX or TorchScript",
     "frontier": "what safety costs: effort against collision rate",
+    "live": "a page: drag obstacles, start and goal; plan, noise and risk follow",
     "plan": "plan one scenario: iterations, certificate, figures",
     "report": "one page of all results: tables, figures, animations",
     "reproduce": "the paper's claims, one by one, by numbers",

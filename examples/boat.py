@@ -19,6 +19,7 @@ class Boat:
     min E ∫ ‖u‖² + 100 max(0, c)² dt,   dx = b dt + σ dB,   E x(10 s) = (2, 5, 0, 0),   |u| ≤ 1
     """
 
+    plane = (0, 1)  # what `slipcar live` draws
     start = np.zeros(4)
     times = np.linspace(0.0, 10.0, 61)
     control_weight = np.eye(2)

@@ -107,11 +107,8 @@ class OpenLoop:
         return np.asarray(u if encode is None else encode(u), dtype=np.float32)
 
     def _interval(self, t: Any) -> Array:
-        # Observations are float32, so a node's time may come back a little early.
         times = self.plan.times
-        rounding = np.finfo(np.float32).eps * (times[-1] - times[0])
-        slack = max(1e-3 * np.min(np.diff(times)), rounding)
-        k = np.searchsorted(times, np.asarray(t) + slack, side="right") - 1
+        k = np.searchsorted(times, np.asarray(t) + clock_slack(times), side="right") - 1
         return np.clip(k, 0, len(times) - 2)
 
     def _decode(self, observation: Any) -> tuple[Array, Array]:
@@ -202,3 +199,9 @@ class Feedback(OpenLoop):
     def _numbers(self) -> list[Array]:
         assert self.plan.gains is not None
         return [*super()._numbers(), self.plan.mean, self.plan.gains]
+
+
+def clock_slack(times: Array) -> float:
+    """How early [s] an interval of these nodes begins: times are observed in float32."""
+    rounding = np.finfo(np.float32).eps * (times[-1] - times[0])
+    return float(max(1e-3 * np.min(np.diff(times)), rounding))

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from slipcar.planner.control_loop import ControlLoop
 from slipcar.planner.controllers import OpenLoop
 from slipcar.planner.moments.gains import closed_loop_covariance, wrap
 from slipcar.planner.newton.running import solve_noise
@@ -148,6 +149,16 @@ class RecedingHorizon(OpenLoop):
             )
         )
         self.replans, self.failures, self.seconds = 0, 0, 0.0
+        self._loop: ControlLoop[Underway] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process steps an episode of its own, by a thread of its own.
+        return {**vars(self), "_loop": None}
+
+    @property
+    def late(self) -> int:
+        """How many calls of `step` played the last good law because their replan was not there."""
+        return 0 if self._loop is None else self._loop.late
 
     @property
     def time_per_replan(self) -> float:
@@ -190,6 +201,53 @@ class RecedingHorizon(OpenLoop):
             u[rows] = self._played(now, rows, int(k), x[rows])
         u = self._replanner.posed.model.admissible(u)
         return self._action(u.reshape(*shape, u.shape[1])), now
+
+    @property
+    def underway(self) -> Underway | None:
+        """The episode that `step` keeps, for `preview`; None before the first step."""
+        return None if self._loop is None else self._loop.state
+
+    def step(self, x: Any, t: float, *, deadline: float | None = None) -> Array:
+        """The control for the state x at time t: one episode, in a control loop.
+
+        With a deadline the replan runs in a thread. If it is not there in time, the last good
+        plan's feedback law u = ū + K (x − μ) is played, `late` counts it, and the replan serves the
+        steps to come. Unlike `predict`, it keeps the episode; a time that goes back begins anew.
+
+        Args:
+            x: observed state, (n,); angles modulo 2π.
+            t: its time [s], on the plan's clock; the last interval lasts for ever.
+            deadline: seconds from the call until it returns, > 0; None waits for the replan.
+
+        Returns:
+            Controls in physical units, (m,), admissible.
+
+        Raises:
+            ValueError: for a state of another shape, what is not finite, or a deadline ≤ 0.
+        """
+        state, n = np.asarray(x, dtype=np.float64), self.plan.mean.shape[1]
+        if state.shape != (n,) or not np.isfinite(state).all():
+            raise ValueError(f"x must be {n} finite numbers, not {x!r}")
+        if not np.isfinite(t):
+            raise ValueError(f"t must be finite [s], not {t!r}")
+        if deadline is not None:
+            check_number("deadline", deadline)
+        if self._loop is None:
+            begun = self._recalled(None, None, np.zeros(1, dtype=np.int64))
+            self._loop = ControlLoop(self._followed, self._renewed, begun)
+        return self._loop.step(state, int(self._interval(t)), deadline)
+
+    def _followed(self, now: Underway, x: Array, k: int) -> Array:
+        """Controls (m,) by the feedback law of the latest plan."""
+        error = wrap(x - now.plans["x"][0, k], self._angles)
+        u = now.plans["u"][0, k] + replanning.applied(now.plans["gains"][0, k], error)
+        return self._replanner.posed.model.admissible(u)
+
+    def _renewed(self, last: Underway, x: Array, k: int) -> tuple[Array, Underway]:
+        """Controls (m,) of a new plan from x, and what is known then."""
+        now = self._recalled(last, None, np.array([k]))
+        u = self._played(now, np.zeros(1, dtype=np.int64), k, x[None])
+        return self._replanner.posed.model.admissible(u)[0], now
 
     def preview(self, state: Underway | None = None, row: int = 0) -> tuple[Array, Array | None]:
         """An episode's latest plan, from the state it was made from; see `OpenLoop.preview`.

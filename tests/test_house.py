@@ -21,15 +21,9 @@ PACKAGES = {
 # What users import and what they get back; its records are known to all rooms but `trace`.
 RECORDS = {"status", "options", "records", "outcome", "actuation", "display"}
 HALL = {
-    "__init__",
-    "planning",
-    "plan",
-    "batch",
-    "receding_horizon",
-    "controllers",
-    "plan_file",
-    "export",
-}
+    "__init__", "planning", "plan", "batch", "receding_horizon", "control_loop", "controllers",
+    "plan_file", "export", "law", "c_code",
+}  # fmt: skip
 # Room -> the rooms below it, which it may import.
 GROUND = {"problem", "trace"}
 ROOMS = {

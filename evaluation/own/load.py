@@ -33,7 +33,15 @@ from slipcar.evaluation.own.digest import behaviour_digest
 if TYPE_CHECKING:
     from slipcar.planner import Plan
 
-__all__ = ["GROUP", "OwnMaker", "entry_points", "load_controller", "load_maker", "split_name"]
+__all__ = [
+    "GROUP",
+    "OwnMaker",
+    "entry_points",
+    "load_controller",
+    "load_maker",
+    "load_object",
+    "split_name",
+]
 
 #: Entry points of this group are controllers by name.
 GROUP = "slipcar.controllers"
@@ -88,7 +96,7 @@ def load_maker(text: str, *, trust: bool = False) -> tuple[str, OwnMaker]:
     elif ":" in source:
         module, _, attribute = source.rpartition(":")
         own = f"{Path(module).stem if module.endswith('.py') else module}:{attribute}"
-        thing = _attribute(_imported(module), attribute, source)
+        thing = load_object(source)
     elif path.suffix in (".safetensors", ".json") or path.is_dir():
         from slipcar.baselines import load_policy
 
@@ -96,6 +104,18 @@ def load_maker(text: str, *, trust: bool = False) -> tuple[str, OwnMaker]:
     else:
         own, thing = source, _entry_point(source)
     return name or own, OwnMaker(thing, own)
+
+
+def load_object(source: str) -> Any:
+    """What `module:object` or `path/to/file.py:object` names; importing it runs the user's code.
+
+    Raises:
+        ValueError: if there is no such module, file or object, or importing it raises.
+    """
+    module, colon, attribute = source.rpartition(":")
+    if not (module and colon and attribute):
+        raise ValueError(f"{source!r} is neither module:object nor path/to/file.py:object")
+    return _attribute(_imported(module), attribute, source)
 
 
 @dataclasses.dataclass(frozen=True)

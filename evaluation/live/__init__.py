@@ -1,0 +1,1 @@
+"""`slipcar live`: a page on which worlds are dragged and plans follow."""
