@@ -1,0 +1,228 @@
+"""Paths of a traced problem under a plan's law, as machine code: what Monte Carlo counts.
+
+    x⁺ = x + Δ(x, u; h) + √h σ(t, x) ξ,    u = ū_k + K_k (x − μ_k) within bounds, held over interval k
+
+with Δ a step of the plan's own integrator, over each interval at once (the plan's discretised
+chain) or in substeps of h = dt/m, between which Brownian bridges are charged
+(:mod:`slipcar.planner.moments.bridge`). A kernel moves a block of paths by one step; noise comes
+from NumPy. The NumPy version is :mod:`slipcar.planner.moments.monte_carlo`, path by path the same.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from slipcar.planner.moments.bridge import crossing
+from slipcar.planner.moments.monte_carlo import BLOCK, Kept, Law, block_generator, block_starts
+from slipcar.planner.newton.posing import Posed
+from slipcar.planner.newton.program import called_with
+from slipcar.planner.newton.quantities import Traced
+from slipcar.planner.problem.model import Model
+from slipcar.planner.trace import emit, machine_code
+from slipcar.planner.trace.elementwise import choose, magnitude, within
+from slipcar.planner.trace.recursion import Carried, Field, Recursion
+
+Array = np.ndarray
+Rows = Any
+#: Beyond it a state is lost.
+_HUGE = 1e300
+#: Of arrays with one row: a law at one node, an instant, and what is to be done there.
+_LAW = ("mean", "nominal", "gains", "lower", "upper")
+
+
+class _Kernels:
+    """One kind of problem: layout, and functions that move a block of paths."""
+
+    def __init__(self, problem: Traced, tails: int, angles: tuple[int, ...]) -> None:
+        self.problem, self.tails, self.angles = problem, tails, angles
+        dims = problem.dims
+        n, m = dims.n, dims.m
+        self.layout = {
+            "t": Field((), True), "dt": Field((), True), "number": Field((dims.numbers,), True),
+            "mean": Field((n,), True), "nominal": Field((m,), True), "gains": Field((m, n), True),
+            "lower": Field((m,), True), "upper": Field((m,), True), "node": Field((), True),
+            "x": Field((n,)), "u": Field((m,)), "noise": Field((dims.d,)),
+            "gap": Field((tails,)), "variance": Field((tails,)), "kept": Field((2,)),
+        }  # fmt: skip
+
+    @property
+    def recursions(self) -> list[Recursion]:
+        """`law` answers to states, `look` charges what was passed, `move` goes on."""
+        steps = {"law": self._law, "look": self._look, "chain": self._chain, "move": self._move}
+        return [Recursion(name, step, lambda rows: {}) for name, step in steps.items()]
+
+    def _law(self, rows: Rows, carried: Carried) -> Carried:
+        error = rows["x"] - rows["mean"]
+        for i in self.angles:
+            turns = error[i] * (0.5 / math.pi) + 0.5
+            error[i] = error[i] - 2.0 * math.pi * turns.floor()
+        u = rows["nominal"] + rows["gains"].dot(error)
+        rows.write("u", within(u, rows["lower"], rows["upper"]))
+        return {}
+
+    def _constraints(self) -> Array:
+        return self.problem.c[len(self.problem.c) - self.tails :]
+
+    def _ahead(self, rows: Rows) -> Array:
+        p, dt = self.problem, rows["dt"]
+        return p.next + p.sigma.dot(np.sqrt(dt) * rows["noise"])
+
+    def _broken(self, rows: Rows) -> Any:
+        """1 where every constraint and the state's size are kept at x, else 0: also for NaN."""
+        kept: Any = magnitude(np.sum(rows["x"])) <= _HUGE
+        for h in self._constraints():
+            kept = kept * (h <= 0.0)
+        return kept
+
+    def _chain(self, rows: Rows, carried: Carried) -> Carried:
+        """Look at a node and go on to the next."""
+        kept = rows["kept"]
+        seen = choose(rows["node"], kept[1] * self._broken(rows), kept[1])
+        rows.write("kept", np.array([kept[0], seen], dtype=object))
+        rows.write("x", self._ahead(rows))
+        return {}
+
+    def _look(self, rows: Rows, carried: Carried) -> Carried:
+        """Charge the bridge that ends at x."""
+        kept, here, gap = rows["kept"], self._broken(rows), -self._constraints()
+        clear: Any = here
+        for q in crossing(rows["gap"], gap, rows["variance"]):
+            clear = clear * (1.0 - q)
+        rows.write("gap", gap)
+        clear = choose(clear, kept[0] * clear, 0.0)
+        seen = choose(rows["node"], kept[1] * here, kept[1])
+        rows.write("kept", np.array([clear, seen], dtype=object))
+        return {}
+
+    def _move(self, rows: Rows, carried: Carried) -> Carried:
+        """Charge the bridge that ends at x, and begin the next one."""
+        self._look(rows, carried)
+        slopes = self.problem.C[len(self.problem.c) - self.tails :]
+        pushed = [row.dot(self.problem.sigma) for row in slopes]
+        variance = [rows["dt"] * push.dot(push) for push in pushed]
+        rows.write("variance", np.array(variance, dtype=object))
+        rows.write("x", self._ahead(rows))
+        return {}
+
+    def code(self, structure: bytes) -> machine_code.Code:
+        """Machine code."""
+        recursions = self.recursions
+        key = repr(("paths", structure, self.problem.dims, self.tails, self.angles)).encode()
+        assembly = functools.partial(
+            emit.module, recursions, self.problem.graph, self.layout, {}
+        )
+        return machine_code.code(key, [r.name for r in recursions], assembly)
+
+
+class _Block(NamedTuple):
+    """Arrays of a block of paths, and kernels bound to them."""
+
+    arrays: dict[str, Array]
+    run: dict[str, Any]
+    table: Array
+
+
+def _block(kernels: _Kernels, code: machine_code.Code) -> _Block:
+    arrays = {
+        name: np.zeros((1 if field.single else BLOCK, field.width))
+        for name, field in kernels.layout.items()
+    }
+    table = np.array([array.ctypes.data for array in arrays.values()], dtype=np.int64)
+    run = {name: called_with(function, BLOCK, table) for name, function in code.long.items()}
+    return _Block(arrays, run, table)
+
+
+class CompiledPaths:
+    """Paths of a problem whose constraints are its last rows; see :class:`Kept`.
+
+    Args:
+        posed: traced, with machine code.
+        law: what drives.
+    """
+
+    def __init__(self, posed: Posed, law: Law) -> None:
+        assert isinstance(posed.problem, Traced)
+        self._model, self._law, problem = posed.model, law, posed.problem
+        angles = tuple(int(i) for i in getattr(posed.model.problem, "angles", ()))
+        key = ("paths", angles)
+        if key not in problem.programs:
+            kernels = _Kernels(problem, posed.tails, angles)
+            problem.programs[key] = (kernels, kernels.code(posed.structure))
+        self._blocks = [_block(*problem.programs[key]) for _ in range(2)]
+        for block in self._blocks:
+            block.arrays["number"][0] = posed.numbers
+
+    def chain(self, seed: int, block: int) -> Array:
+        """Paths of one block that keep the constraints at every node, (BLOCK,) of 0 and 1."""
+        model, (arrays, run, _) = self._model, self._blocks[0]
+        rng = block_generator(seed, block)
+        self._begin(arrays, block_starts(model, seed, block))
+        for k, dt in enumerate(model.dt):
+            arrays["t"][:], arrays["dt"][:], arrays["node"][:] = model.times[k], dt, float(k > 0)
+            self._lead(arrays, k)
+            run["law"]()
+            rng.standard_normal(out=arrays["noise"])
+            run["chain"]()
+        arrays["t"][:], arrays["node"][:] = model.times[-1], 1.0
+        run["look"]()
+        return arrays["kept"][:, 1].copy()
+
+    def path(self, seed: int, block: int, substeps: int, halved: bool) -> list[Kept]:
+        """What a block keeps at every instant, in `substeps`; `halved` in half as many too.
+
+        Both see the same Brownian motion; the finer comes first.
+        """
+        model, blocks = self._model, self._blocks[: 1 + halved]
+        rng = block_generator(seed, block)
+        for arrays, _, _ in blocks:
+            self._begin(arrays, block_starts(model, seed, block))
+        first, noise = blocks[0], blocks[0].arrays["noise"]
+        for k, dt in enumerate(model.dt):
+            for arrays, run, _ in blocks:
+                self._lead(arrays, k)
+                run["law"]()
+            for j in range(substeps):
+                h = dt / substeps
+                rng.standard_normal(out=noise)
+                if halved:
+                    coarse = blocks[1].arrays["noise"]
+                    coarse[:] = noise if j % 2 == 0 else (coarse + noise) * math.sqrt(0.5)
+                self._move(first, model.times[k] + j * h, h, float(k > 0 and j == 0))
+                if halved and j % 2:
+                    begun = model.times[k] + (j - 1) * h
+                    self._move(blocks[1], begun, 2.0 * h, float(k > 0 and j == 1))
+        for arrays, run, _ in blocks:
+            arrays["t"][:], arrays["node"][:] = model.times[-1], 1.0
+            run["look"]()
+        return [Kept(*arrays["kept"].T.copy()) for arrays, _, _ in blocks]
+
+    @staticmethod
+    def _move(block: _Block, t: float, h: float, node: float) -> None:
+        arrays = block.arrays
+        arrays["t"][:], arrays["dt"][:], arrays["node"][:] = t, h, node
+        block.run["move"]()
+
+    def _begin(self, arrays: dict[str, Array], x: Array) -> None:
+        arrays["x"][:], arrays["kept"][:] = x, 1.0
+        # Nothing is charged for what lies before the start, unless it is broken there.
+        arrays["gap"][:], arrays["variance"][:] = 1.0, 0.0
+
+    def _lead(self, arrays: dict[str, Array], k: int) -> None:
+        law, model = self._law, self._model
+        arrays["mean"][0], arrays["nominal"][0] = law.x[k], law.u[k]
+        arrays["gains"][0] = law.gains[k].ravel()
+        arrays["lower"][0], arrays["upper"][0] = model.lower, model.upper
+
+
+def compiles(posed: Posed) -> bool:
+    """Whether paths of a posed problem can be machine code."""
+    return posed.native and isinstance(posed.problem, Traced)
+
+
+def driven_by(posed: Posed, law: Law, model: Model) -> CompiledPaths | None:
+    """Machine code for these paths, or None where there is none."""
+    return CompiledPaths(posed.of(model), law) if compiles(posed) else None
