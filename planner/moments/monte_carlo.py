@@ -1,11 +1,21 @@
 """How often a controller breaks a constraint: paths of the non-linear equation, counted.
 
-    x_{k+1} = x_k + dt_k b(t_k, x_k, u_k) + √dt_k σ(t_k, x_k) ξ_k,    u_k = control(t_k, x_k)
+Two answers, from x_0 ~ N(start, Σ_0) with the control held over each interval, Δ(x; h) a step of
+the model's integrator and ξ standard normal:
 
-Euler–Maruyama on the planner's own nodes, from x_0 ~ N(start, Σ_0). Starts and noise are common
-to all controllers: path i of a seed meets the same x_0 and ξ whoever drives and however many paths
-are asked for, so two rates differ by what the controllers do, and a search over plans sees a
-nearly monotone function.
+* the *chain* on the planner's own nodes, x_{k+1} = x_k + Δ(x_k; dt) + √dt σ(t_k, x_k) ξ_k, for
+  Euler's integrator that of Euler and Maruyama: does it break a constraint at a node?
+* the *path* of the SDE, in m substeps of h = dt/m, each half a drift, the noise, the other half:
+
+      y = x + Δ(x; h/2),    z = y + √h σ(t + h/2, y) ξ,    x⁺ = z + Δ(z; h/2)
+
+  Does it break a constraint at any instant? Between substeps it is a Brownian bridge
+  (:mod:`.bridge`). Strang's splitting has no error of first order where noise is additive or is a
+  function of states that it does not reach, where Euler and Maruyama's substeps have one.
+
+Starts and noise are common to all controllers: path i of a seed meets the same x_0 and ξ whoever
+drives and however many paths are asked for, so two rates differ by what the controllers do, and a
+search over plans sees a nearly monotone function.
 """
 
 from __future__ import annotations
@@ -141,14 +151,6 @@ def _gaps(model: Model, t: Array, x: Array) -> Array:
     return np.where(np.isfinite(x).all(axis=1)[:, None], -h, np.nan)
 
 
-def _step(model: Model, t: Array, h: float, x: Array, u: Array, normal: Any) -> Array:
-    """One step of the integrator and of the noise; `normal` makes variates of a shape."""
-    sigma = model.diffusion(t, x)
-    noise = np.sqrt(h) * normal((BLOCK, sigma.shape[-1]))
-    moved = change(model.integrator, model.drift, t, h, x, u)
-    return x + moved + np.einsum("bij,bj->bi", sigma, noise)
-
-
 def _controls(model: Model, control: Callable[[float, Array], Array], t: float, x: Array) -> Array:
     u = np.asarray(control(t, x))
     if u.shape not in ((model.control_dim,), (BLOCK, model.control_dim)):
@@ -169,7 +171,10 @@ def chain(model: Model, control: Callable[[float, Array], Array], seed: int, blo
     for k, dt in enumerate(model.dt):
         t = np.full(BLOCK, model.times[k])  # one for each path: all functions are batched alike
         u = _controls(model, control, float(model.times[k]), x)
-        x = _step(model, t, dt, x, u, rng.standard_normal)
+        sigma = model.diffusion(t, x)
+        noise = np.sqrt(dt) * rng.standard_normal((BLOCK, sigma.shape[-1]))
+        moved = change(model.integrator, model.drift, t, dt, x, u)
+        x = x + moved + np.einsum("bij,bj->bi", sigma, noise)
         at = np.full(BLOCK, model.times[k + 1])
         kept &= (_gaps(model, at, x) >= 0.0).all(axis=1)  # NaN is a violation
         lost = ~np.isfinite(x).all(axis=1)
@@ -188,10 +193,14 @@ def path(
         u, h = _controls(model, control, float(model.times[k]), x), dt / substeps
         for j in range(substeps):
             t = np.full(BLOCK, model.times[k] + j * h)
-            slope = np.asarray(model.jacobians.state("constraint", t, x))
-            pushed = slope @ model.diffusion(t, x)
-            x = _step(model, t, h, x, u, rng.standard_normal)
-            before, gap = gap, _gaps(model, t + h, x)
+            x = x + change(model.integrator, model.drift, t, 0.5 * h, x, u)
+            t = t + 0.5 * h
+            sigma = model.diffusion(t, x)
+            pushed = np.asarray(model.jacobians.state("constraint", t, x)) @ sigma
+            noise = np.sqrt(h) * rng.standard_normal((BLOCK, sigma.shape[-1]))
+            x = x + np.einsum("bij,bj->bi", sigma, noise)
+            x = x + change(model.integrator, model.drift, t, 0.5 * h, x, u)
+            before, gap = gap, _gaps(model, t + 0.5 * h, x)
             clear = (1.0 - crossing(before, gap, h * (pushed * pushed).sum(axis=-1))).prod(axis=1)
             kept *= np.where((gap >= 0.0).all(axis=1) & (clear >= 0.0), clear, 0.0)
             lost = ~np.isfinite(x).all(axis=1)

@@ -1,11 +1,8 @@
 """Paths of a traced problem under a plan's law, as machine code: what Monte Carlo counts.
 
-    x⁺ = x + Δ(x, u; h) + √h σ(t, x) ξ,    u = ū_k + K_k (x − μ_k) within bounds, held over interval k
-
-with Δ a step of the plan's own integrator, over each interval at once (the plan's discretised
-chain) or in substeps of h = dt/m, between which Brownian bridges are charged
-(:mod:`slipcar.planner.moments.bridge`). A kernel moves a block of paths by one step; noise comes
-from NumPy. The NumPy version is :mod:`slipcar.planner.moments.monte_carlo`, path by path the same.
+Equations and meaning are those of :mod:`slipcar.planner.moments.monte_carlo`, which runs where
+there is no machine code, path by path the same. A kernel moves a block of paths by one step; noise
+comes from NumPy.
 """
 
 from __future__ import annotations
@@ -51,8 +48,9 @@ class _Kernels:
 
     @property
     def recursions(self) -> list[Recursion]:
-        """`law` answers to states, `look` charges what was passed, `move` goes on."""
-        steps = {"law": self._law, "look": self._look, "chain": self._chain, "move": self._move}
+        """`law` answers to states, `look` charges what was passed, the others go on."""
+        steps = {"law": self._law, "look": self._look, "chain": self._chain, "drift": self._drift,
+                 "kick": self._kick, "glide": self._glide}  # fmt: skip
         return [Recursion(name, step, lambda rows: {}) for name, step in steps.items()]
 
     def _law(self, rows: Rows, carried: Carried) -> Carried:
@@ -67,11 +65,7 @@ class _Kernels:
     def _constraints(self) -> Array:
         return self.problem.c[len(self.problem.c) - self.tails :]
 
-    def _ahead(self, rows: Rows) -> Array:
-        p, dt = self.problem, rows["dt"]
-        return p.next + p.sigma.dot(np.sqrt(dt) * rows["noise"])
-
-    def _broken(self, rows: Rows) -> Any:
+    def _whole(self, rows: Rows) -> Any:
         """1 where every constraint and the state's size are kept at x, else 0: also for NaN."""
         kept: Any = magnitude(np.sum(rows["x"])) <= _HUGE
         for h in self._constraints():
@@ -81,14 +75,15 @@ class _Kernels:
     def _chain(self, rows: Rows, carried: Carried) -> Carried:
         """Look at a node and go on to the next."""
         kept = rows["kept"]
-        seen = choose(rows["node"], kept[1] * self._broken(rows), kept[1])
+        seen = choose(rows["node"], kept[1] * self._whole(rows), kept[1])
         rows.write("kept", np.array([kept[0], seen], dtype=object))
-        rows.write("x", self._ahead(rows))
+        p, dt = self.problem, rows["dt"]
+        rows.write("x", p.next + p.sigma.dot(np.sqrt(dt) * rows["noise"]))
         return {}
 
     def _look(self, rows: Rows, carried: Carried) -> Carried:
         """Charge the bridge that ends at x."""
-        kept, here, gap = rows["kept"], self._broken(rows), -self._constraints()
+        kept, here, gap = rows["kept"], self._whole(rows), -self._constraints()
         clear: Any = here
         for q in crossing(rows["gap"], gap, rows["variance"]):
             clear = clear * (1.0 - q)
@@ -98,14 +93,23 @@ class _Kernels:
         rows.write("kept", np.array([clear, seen], dtype=object))
         return {}
 
-    def _move(self, rows: Rows, carried: Carried) -> Carried:
-        """Charge the bridge that ends at x, and begin the next one."""
+    def _drift(self, rows: Rows, carried: Carried) -> Carried:
+        """Charge the bridge that ends at x, and begin the next substep: half of its drift."""
         self._look(rows, carried)
-        slopes = self.problem.C[len(self.problem.c) - self.tails :]
-        pushed = [row.dot(self.problem.sigma) for row in slopes]
-        variance = [rows["dt"] * push.dot(push) for push in pushed]
-        rows.write("variance", np.array(variance, dtype=object))
-        rows.write("x", self._ahead(rows))
+        rows.write("x", self.problem.next)
+        return {}
+
+    def _kick(self, rows: Rows, carried: Carried) -> Carried:
+        """The noise of a substep, twice dt long, at its middle."""
+        p, h = self.problem, 2.0 * rows["dt"]
+        pushed = [row.dot(p.sigma) for row in p.C[len(p.c) - self.tails :]]
+        rows.write("variance", np.array([h * push.dot(push) for push in pushed], dtype=object))
+        rows.write("x", rows["x"] + p.sigma.dot(np.sqrt(h) * rows["noise"]))
+        return {}
+
+    def _glide(self, rows: Rows, carried: Carried) -> Carried:
+        """The other half of its drift."""
+        rows.write("x", self.problem.next)
         return {}
 
     def code(self, structure: bytes) -> machine_code.Code:
@@ -191,20 +195,23 @@ class CompiledPaths:
                 if halved:
                     coarse = blocks[1].arrays["noise"]
                     coarse[:] = noise if j % 2 == 0 else (coarse + noise) * math.sqrt(0.5)
-                self._move(first, model.times[k] + j * h, h, float(k > 0 and j == 0))
+                self._substep(first, model.times[k] + j * h, h, float(k > 0 and j == 0))
                 if halved and j % 2:
                     begun = model.times[k] + (j - 1) * h
-                    self._move(blocks[1], begun, 2.0 * h, float(k > 0 and j == 1))
+                    self._substep(blocks[1], begun, 2.0 * h, float(k > 0 and j == 1))
         for arrays, run, _ in blocks:
             arrays["t"][:], arrays["node"][:] = model.times[-1], 1.0
             run["look"]()
         return [Kept(*arrays["kept"].T.copy()) for arrays, _, _ in blocks]
 
     @staticmethod
-    def _move(block: _Block, t: float, h: float, node: float) -> None:
-        arrays = block.arrays
-        arrays["t"][:], arrays["dt"][:], arrays["node"][:] = t, h, node
-        block.run["move"]()
+    def _substep(block: _Block, t: float, h: float, node: float) -> None:
+        arrays, run = block.arrays, block.run
+        arrays["t"][:], arrays["dt"][:], arrays["node"][:] = t, 0.5 * h, node
+        run["drift"]()
+        arrays["t"][:] = t + 0.5 * h
+        run["kick"]()
+        run["glide"]()
 
     def _begin(self, arrays: dict[str, Array], x: Array) -> None:
         arrays["x"][:], arrays["kept"][:] = x, 1.0
