@@ -183,29 +183,55 @@ def chain(model: Model, control: Callable[[float, Array], Array], seed: int, blo
 
 
 def path(
-    model: Model, control: Callable[[float, Array], Array], seed: int, block: int, substeps: int
-) -> Kept:
-    """What the paths of one block keep, at every instant and at nodes."""
-    rng, x = block_generator(seed, block), block_starts(model, seed, block)
-    gap = _gaps(model, np.full(BLOCK, model.times[0]), x)
-    kept, nodes = (gap >= 0.0).all(axis=1).astype(float), np.ones(BLOCK)
+    model: Model,
+    control: Callable[[float, Array], Array],
+    seed: int,
+    block: int,
+    substeps: int,
+    halved: bool = False,
+) -> list[Kept]:
+    """What the paths of one block keep; `halved` in half as many substeps too, the finer first.
+
+    Both see the same Brownian motion.
+    """
+    rng = block_generator(seed, block)
+    strands = [_Strand(model, block_starts(model, seed, block)) for _ in range(1 + halved)]
     for k, dt in enumerate(model.dt):
-        u, h = _controls(model, control, float(model.times[k]), x), dt / substeps
+        h, t, coarse = dt / substeps, float(model.times[k]), np.zeros(())
+        held = [_controls(model, control, t, strand.x) for strand in strands]
+        d = np.shape(model.diffusion(np.full(1, t), model.start[None]))[-1]
         for j in range(substeps):
-            t = np.full(BLOCK, model.times[k] + j * h)
-            x = x + change(model.integrator, model.drift, t, 0.5 * h, x, u)
-            t = t + 0.5 * h
-            sigma = model.diffusion(t, x)
-            pushed = np.asarray(model.jacobians.state("constraint", t, x)) @ sigma
-            noise = np.sqrt(h) * rng.standard_normal((BLOCK, sigma.shape[-1]))
-            x = x + np.einsum("bij,bj->bi", sigma, noise)
-            x = x + change(model.integrator, model.drift, t, 0.5 * h, x, u)
-            before, gap = gap, _gaps(model, t + 0.5 * h, x)
-            clear = (1.0 - crossing(before, gap, h * (pushed * pushed).sum(axis=-1))).prod(axis=1)
-            kept *= np.where((gap >= 0.0).all(axis=1) & (clear >= 0.0), clear, 0.0)
-            lost = ~np.isfinite(x).all(axis=1)
-            if lost.any():
-                kept[lost], nodes[lost], x[lost] = 0.0, 0.0, model.start
-                gap[lost] = 0.0
-        nodes *= (gap >= 0.0).all(axis=1)
-    return Kept(kept, nodes)
+            noise = rng.standard_normal((BLOCK, d))
+            strands[0].move(t + j * h, h, held[0], noise)
+            coarse = coarse + noise if j % 2 else noise
+            if halved and j % 2:
+                strands[1].move(t + (j - 1) * h, 2.0 * h, held[1], coarse * np.sqrt(0.5))
+        for strand in strands:
+            strand.nodes *= strand.whole
+    return [Kept(strand.kept, strand.nodes) for strand in strands]
+
+
+class _Strand:
+    """Paths of a block, on their way."""
+
+    def __init__(self, model: Model, x: Array) -> None:
+        self._model, self.x = model, x
+        self.gap = _gaps(model, np.full(BLOCK, model.times[0]), x)
+        self.whole = (self.gap >= 0.0).all(axis=1)
+        self.kept, self.nodes = self.whole.astype(float), np.ones(BLOCK)
+
+    def move(self, t: float, h: float, u: Array, noise: Array) -> None:
+        """One substep, its bridges charged."""
+        model, middle, end = self._model, np.full(BLOCK, t + 0.5 * h), np.full(BLOCK, t + h)
+        x = self.x + change(model.integrator, model.drift, np.full(BLOCK, t), 0.5 * h, self.x, u)
+        sigma = model.diffusion(middle, x)
+        pushed = np.asarray(model.jacobians.state("constraint", middle, x)) @ sigma
+        x = x + np.einsum("bij,bj->bi", sigma, np.sqrt(h) * noise)
+        x = x + change(model.integrator, model.drift, middle, 0.5 * h, x, u)
+        before, self.x, self.gap = self.gap, x, _gaps(model, end, x)
+        q = crossing(before, self.gap, h * (pushed * pushed).sum(axis=-1))
+        self.whole = (self.gap >= 0.0).all(axis=1)  # NaN is a violation
+        self.kept *= np.where(self.whole, (1.0 - q).prod(axis=1), 0.0)
+        lost = ~np.isfinite(x).all(axis=1)
+        if lost.any():  # any finite state: their verdict stands
+            self.x[lost], self.nodes[lost], self.kept[lost] = model.start, 0.0, 0.0

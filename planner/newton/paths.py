@@ -116,9 +116,7 @@ class _Kernels:
         """Machine code."""
         recursions = self.recursions
         key = repr(("paths", structure, self.problem.dims, self.tails, self.angles)).encode()
-        assembly = functools.partial(
-            emit.module, recursions, self.problem.graph, self.layout, {}
-        )
+        assembly = functools.partial(emit.module, recursions, self.problem.graph, self.layout, {})
         return machine_code.code(key, [r.name for r in recursions], assembly)
 
 
