@@ -21,7 +21,7 @@ search over plans sees a nearly monotone function.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 

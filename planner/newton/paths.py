@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from slipcar.planner.moments.monte_carlo import BLOCK, Kept, Law, block_generato
 from slipcar.planner.newton.posing import Posed
 from slipcar.planner.newton.program import called_with
 from slipcar.planner.newton.quantities import Traced
-from slipcar.planner.problem.model import Model
 from slipcar.planner.trace import emit, machine_code
 from slipcar.planner.trace.elementwise import choose, magnitude, within
 from slipcar.planner.trace.recursion import Carried, Field, Recursion
@@ -27,8 +27,7 @@ Array = np.ndarray
 Rows = Any
 #: Beyond it a state is lost.
 _HUGE = 1e300
-#: Of arrays with one row: a law at one node, an instant, and what is to be done there.
-_LAW = ("mean", "nominal", "gains", "lower", "upper")
+_lock = threading.Lock()
 
 
 class _Kernels:
@@ -151,10 +150,13 @@ class CompiledPaths:
         self._model, self._law, problem = posed.model, law, posed.problem
         angles = tuple(int(i) for i in getattr(posed.model.problem, "angles", ()))
         key = ("paths", angles)
-        if key not in problem.programs:
-            kernels = _Kernels(problem, posed.tails, angles)
-            problem.programs[key] = (kernels, kernels.code(posed.structure))
-        self._blocks = [_block(*problem.programs[key]) for _ in range(2)]
+        with _lock:
+            if key not in problem.programs:
+                kernels = _Kernels(problem, posed.tails, angles)
+                problem.programs[key] = (kernels, kernels.code(posed.structure))
+            # Its code must live as long as the functions that are taken from it.
+            self._program = problem.programs[key]
+        self._blocks = [_block(*self._program) for _ in range(2)]
         for block in self._blocks:
             block.arrays["number"][0] = posed.numbers
 
@@ -226,8 +228,3 @@ class CompiledPaths:
 def compiles(posed: Posed) -> bool:
     """Whether paths of a posed problem can be machine code."""
     return posed.native and isinstance(posed.problem, Traced)
-
-
-def driven_by(posed: Posed, law: Law, model: Model) -> CompiledPaths | None:
-    """Machine code for these paths, or None where there is none."""
-    return CompiledPaths(posed.of(model), law) if compiles(posed) else None

@@ -7,7 +7,8 @@
     midpoint:  x⁺ = x + dt b(t + dt/2, x + dt/2 b(t, x))                           order 2
 
 Euler is the paper's scheme (§6.1) and that of its Monte Carlo; with rk4 the mean follows the
-continuous-time system; midpoint is of simulated paths, in substeps. The noise of an interval is dt σσᵀ at its beginning either way.
+continuous-time system; midpoint is of simulated paths, in substeps. The noise of
+an interval is dt σσᵀ at its beginning either way.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from slipcar.planner.newton.paths import CompiledPaths, compiles
 from slipcar.planner.newton.posing import Posed, pose
 from slipcar.planner.newton.running import Steered
 from slipcar.planner.problem.model import Model
+from slipcar.planner.search.tasks import in_threads
 
 Array = np.ndarray
 
@@ -22,7 +24,7 @@ Array = np.ndarray
 _SUBSTEPS, _FINEST = 4, 64
 #: Blocks of paths that judge a number of substeps, and those after which a rate that is more than
 #: so many standard errors off its target needs no more.
-_JUDGED, _FIRST, _OFF = 5, 4, 4.0
+_JUDGED, _FIRST, _OFF = 6, 4, 4.0
 
 
 class Counting:
@@ -34,31 +36,56 @@ class Counting:
         at_path: whether to count at every instant of the SDE, or at nodes of the chain.
 
     Attributes:
-        substeps: of each interval; 1 at nodes.
+        substeps: of each interval, in verification; 1 at nodes.
         seconds: spent so far.
     """
 
     def __init__(self, model: Model, posed: Posed, *, at_path: bool) -> None:
         self._model, self._posed, self.at_path = model, posed, at_path
         self.substeps, self.seconds = _SUBSTEPS if at_path else 1, 0.0
+        self._coarse = 1.0  # the rate in `substeps`, of that in as few as possible
 
-    def rate(
-        self, plan: Steered, episodes: int, seed: int, target: float | None = None
-    ) -> tuple[float, float]:
-        """Share of paths that violate, as promised and at nodes.
+    def rates(self, plan: Steered, episodes: int, seed: int) -> tuple[float, float]:
+        """Share of paths that violate, as promised and at nodes; path i depends on (seed, i)."""
+        return self._rates(plan, episodes, seed, self.substeps, None)
 
-        Args:
-            plan: whose law drives.
-            episodes: how many paths; path i depends on (seed, i), and on the substeps.
-            seed: of the Brownian paths.
-            target: where the first paths tell that the rate is far off it, they are enough.
+    def search_rate(self, plan: Steered, episodes: int, seed: int, target: float) -> float:
+        """What :meth:`rates` would say, in few substeps; on few paths if it is far off target."""
+        substeps = min(_SUBSTEPS, self.substeps)
+        return self._coarse * self._rates(plan, episodes, seed, substeps, target / self._coarse)[0]
+
+    def refine(self, plan: Steered, delta: float, episodes: int, seed: int) -> None:
+        """Double the substeps until the rate moves by less than its error.
+
+        Both numbers of substeps see the same Brownian motions. The error is that of a rate δ on
+        `episodes` paths; a rate that is not near δ moves in proportion.
         """
-        began, driven = time.perf_counter(), self._driven(plan)
+        if not self.at_path:
+            return
+        began, error = time.perf_counter(), math.sqrt(delta * (1.0 - delta) / episodes)
+        self.substeps, self._coarse = _SUBSTEPS, 1.0
+        while self.substeps < _FINEST:
+            blocks = [(seed, block) for block in range(_JUDGED)]
+            pairs = self._each(plan, blocks, lambda driven, at: driven.pair(*at, self.substeps))
+            fine, coarse = 1.0 - np.mean(pairs, axis=(0, 2))
+            if self.substeps > _SUBSTEPS and coarse > 0.0:
+                self._coarse *= fine / coarse
+            if abs(fine - coarse) * delta <= error * max(fine, delta):
+                break
+            self.substeps *= 2
+        self.seconds += time.perf_counter() - began
+
+    def _rates(
+        self, plan: Steered, episodes: int, seed: int, substeps: int, target: float | None
+    ) -> tuple[float, float]:
+        began = time.perf_counter()
+        blocks = [(seed, block) for block in range(-(-episodes // BLOCK))]
         broken: list[Array] = []
-        for block in range(-(-episodes // BLOCK)):
-            kept = driven.path(seed, block, self.substeps) if self.at_path else driven(seed, block)
-            broken.append(1.0 - np.asarray(kept))
-            if target is not None and block % _FIRST == _FIRST - 1:
+        for first in range(0, len(blocks), _FIRST):
+            group = blocks[first : first + _FIRST]
+            kept = self._each(plan, group, lambda driven, at: driven.kept(*at, substeps))
+            broken += [1.0 - np.asarray(each) for each in kept]
+            if target is not None:
                 p = np.concatenate(broken, axis=1)[0]
                 if abs(p.mean() - target) > _OFF * max(p.std(), target**0.5) / len(p) ** 0.5:
                     break
@@ -66,29 +93,19 @@ class Counting:
         self.seconds += time.perf_counter() - began
         return float(rates[0]), float(rates[-1])
 
-    def refine(self, plan: Steered, delta: float, episodes: int, seed: int) -> bool:
-        """Double the substeps until the rate moves by less than its error; whether they changed.
-
-        Both numbers of substeps see the same Brownian motions. The error is that of a rate δ on
-        `episodes` paths; a rate that is not near δ moves in proportion.
-        """
-        if not self.at_path:
-            return False
-        began, before, driven = time.perf_counter(), self.substeps, self._driven(plan)
-        error = math.sqrt(delta * (1.0 - delta) / episodes)
-        while self.substeps < _FINEST:
-            pairs = [driven.pair(seed, block, self.substeps) for block in range(_JUDGED)]
-            fine, coarse = 1.0 - np.mean(pairs, axis=(0, 2))
-            if abs(fine - coarse) * delta <= error * max(fine, delta):
-                break
-            self.substeps *= 2
-        self.seconds += time.perf_counter() - began
-        return self.substeps != before
+    def _each(
+        self, plan: Steered, blocks: list[Any], count: Callable[[Any, Any], Any]
+    ) -> list[Any]:
+        """What `count` says of blocks, shared out over threads: the numbers do not depend on it."""
+        self._simulated  # noqa: B018  traced once, by one thread
+        return in_threads(lambda at: count(self._driven(plan), at), blocks, 0)
 
     def _driven(self, plan: Steered) -> Any:
         law = Law(plan.x, plan.u, plan.gains)
         model, posed = self._simulated
-        return _Compiled(CompiledPaths(posed, law)) if compiles(posed) else _InNumPy(model, law)
+        if compiles(posed):
+            return _Compiled(posed, law, self.at_path)
+        return _InNumPy(model, law, self.at_path)
 
     @functools.cached_property
     def _simulated(self) -> tuple[Model, Posed]:
@@ -101,13 +118,12 @@ class Counting:
 
 
 class _Compiled:
-    def __init__(self, paths: CompiledPaths) -> None:
-        self._paths = paths
+    def __init__(self, posed: Posed, law: Law, on_path: bool) -> None:
+        self._paths, self._on_path = CompiledPaths(posed, law), on_path
 
-    def __call__(self, seed: int, block: int) -> Array:
-        return self._paths.chain(seed, block)[None]
-
-    def path(self, seed: int, block: int, substeps: int) -> Kept:
+    def kept(self, seed: int, block: int, substeps: int) -> Kept | list[Array]:
+        if not self._on_path:
+            return [self._paths.chain(seed, block)]
         return self._paths.path(seed, block, substeps, False)[0]
 
     def pair(self, seed: int, block: int, substeps: int) -> list[Array]:
@@ -115,13 +131,12 @@ class _Compiled:
 
 
 class _InNumPy:
-    def __init__(self, model: Model, law: Law) -> None:
-        self._model, self._control = model, control_of(model, law)
+    def __init__(self, model: Model, law: Law, on_path: bool) -> None:
+        self._model, self._control, self._on_path = model, control_of(model, law), on_path
 
-    def __call__(self, seed: int, block: int) -> Array:
-        return chain(self._model, self._control, seed, block)[None]
-
-    def path(self, seed: int, block: int, substeps: int) -> Kept:
+    def kept(self, seed: int, block: int, substeps: int) -> Kept | list[Array]:
+        if not self._on_path:
+            return [chain(self._model, self._control, seed, block)]
         return path(self._model, self._control, seed, block, substeps)[0]
 
     def pair(self, seed: int, block: int, substeps: int) -> list[Array]:

@@ -230,16 +230,14 @@ class _Calibration:
             rate = self._measure(free)
             self._tried.append(PricedRate(0.0, field.predicted_risk(free), rate))
             if rate <= self._target:
-                self._counting.refine(free, delta, self._episodes, _SEARCH_SEED)
+                self._refine(free)
                 if (verified := self._verified(free, 0)) <= delta:
                     return self._answer(free, 0.0, verified, True)
         price = _FIRST * max(abs(field.attempt.effort), 1e-6) / delta
+        if (first := field.solve(price)) is not None:
+            self._refine(first)
         for attempt in range(_VERIFICATIONS):
             search = self._searched(price)
-            if search.best is not None and self._counting.refine(
-                search.best, delta, self._episodes, _SEARCH_SEED
-            ):
-                search = self._searched(search.price)
             plan, price = search.best, search.price
             if plan is None:
                 last = field.attempt
@@ -251,6 +249,9 @@ class _Calibration:
             # Fresh paths disagree with those of the search: ask for less.
             self._target *= 0.9 * delta / verified
         return self._answer(plan, price, verified, search.reached and verified <= delta)
+
+    def _refine(self, plan: Steered) -> None:
+        self._counting.refine(plan, self._delta, self._episodes, _SEARCH_SEED)
 
     def _searched(self, price: float) -> PriceSearch:
         """The search from a price."""
@@ -270,12 +271,12 @@ class _Calibration:
     def _measure(self, plan: Steered) -> float:
         """The rate on the paths of the search; predicted where they are too few to tell."""
         if self._countable:
-            return self._counting.rate(plan, self._paths, _SEARCH_SEED, self._target)[0]
+            return self._counting.search_rate(plan, self._paths, _SEARCH_SEED, self._target)
         return self._field.predicted_risk(plan)
 
     def _verified(self, plan: Steered, attempt: int) -> float:
         seed = _VERIFICATION_SEED + attempt
-        rate, self._at_nodes = self._counting.rate(plan, self._episodes, seed)
+        rate, self._at_nodes = self._counting.rates(plan, self._episodes, seed)
         return rate
 
     def _successes(self, rate: float) -> float:
