@@ -20,6 +20,7 @@ import peers
 import planners
 import report
 import risk_paper
+import risk_path
 import risk_times
 import risk_worlds
 import simulation
@@ -29,14 +30,14 @@ import worlds
 
 PARTS = ("planners", "growth", "cold", "simulation", "environment", "risk_times")
 #: Minutes; on request.
-LONG_PARTS = ("worlds", "systems", "risk_paper", "risk")
+LONG_PARTS = ("worlds", "systems", "risk_paper", "risk_path", "risk")
 #: Pages of the docs: file, heading and parts.
 PAGES = (
     ("benchmarks.md", "Benchmarks", ("planners", "growth", "cold", "simulation", "worlds")),
     (
         "benchmarks-risk.md",
         "Benchmarks: risk, feedback, receding horizon",
-        ("risk_paper", "risk_times", "risk"),
+        ("risk_paper", "risk_path", "risk_times", "risk"),
     ),
     ("benchmarks-systems.md", "Benchmarks: users' systems", ("systems",)),
     ("benchmarks-environment.md", "Benchmarks: environment", ("environment",)),
@@ -56,6 +57,7 @@ def main() -> None:
         "worlds": functools.partial(worlds.section, arguments.seeds, folder),
         "systems": functools.partial(systems.section.section, folder),
         "risk_paper": risk_paper.section,
+        "risk_path": risk_path.section,
         "risk": functools.partial(risk_worlds.section, arguments.risk_worlds, folder),
     }
     for part in arguments.only:

@@ -20,6 +20,8 @@ OPEN_RISK, FEEDBACK_RISK = 0.01, 0.001
 CHANCE = f"SCP, risk ≤ {100 * OPEN_RISK:g} %"
 STEERED = "planned feedback"
 STEERED_CHANCE = f"planned feedback, risk ≤ {100 * FEEDBACK_RISK:g} %"
+#: The same at any instant of the SDE, where a finer simulation can tell.
+PATH_CHANCE, STEERED_PATH_CHANCE = f"{CHANCE} on the path", f"{STEERED_CHANCE} on the path"
 RECEDING = "receding horizon"
 RECEDING_MARGINS = "receding horizon with margins"
 #: Price of risk where none could be calibrated [cost per unit of probability].
@@ -33,6 +35,7 @@ def default_rows(
     *,
     variance_weight: float = 1.0,
     policy: Controller | None = None,
+    substeps: int = 1,
 ) -> tuple[dict[str, Controller | Runs], list[str]]:
     """Controllers by name, in the order of the table, and what a reader must be told of them.
 
@@ -48,6 +51,8 @@ def default_rows(
         variance_weight: of stochastic SCP; the rows beyond the paper charge what the noise is
             expected to cost, and need none.
         policy: the only learned row; None takes all that are shipped.
+        substeps: of the simulation. Risks are promised at nodes of the planner's chain; with
+            several substeps rows are added that promise them at any instant of the SDE.
 
     Raises:
         ValueError: for a scenario that cannot be driven or planned.
@@ -75,6 +80,8 @@ def default_rows(
         notes += plan_notes(name, found)
     rows |= learned(scenario, policy, notes)
     rows |= _beyond_the_paper(scenario, notes)
+    if substeps > 1:
+        rows |= _on_the_path(scenario, notes)
     return rows, notes
 
 
@@ -130,3 +137,15 @@ def _beyond_the_paper(scenario: Scenario, notes: list[str]) -> dict[str, Control
         RECEDING: RecedingHorizon(scenario),
         RECEDING_MARGINS: RecedingHorizon(scenario, risk_price=price),
     }
+
+
+def _on_the_path(scenario: Scenario, notes: list[str]) -> dict[str, Controller]:
+    """Rows whose risk is promised at any instant; what was verified of each is noted."""
+    chance = plan(scenario, risk=OPEN_RISK, risk_at="path")
+    steered = plan(scenario, feedback=True, risk=FEEDBACK_RISK, risk_at="path")
+    for name, found in ((PATH_CHANCE, chance), (STEERED_PATH_CHANCE, steered)):
+        notes += plan_notes(name, found)
+        if found.risk is not None and found.status.ok:
+            nodes = found.risk.verified_at_nodes or 0.0
+            notes.append(f"{name}: {found.risk}; at nodes of the same paths {nodes:.3%}.")
+    return {PATH_CHANCE: OpenLoop(chance), STEERED_PATH_CHANCE: Feedback(steered)}

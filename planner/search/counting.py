@@ -50,7 +50,9 @@ class Counting:
         return self._rates(plan, episodes, seed, self.substeps, None)
 
     def search_rate(self, plan: Steered, episodes: int, seed: int, target: float) -> float:
-        """What :meth:`rates` would say, in few substeps; on few paths if it is far off target."""
+        """What :meth:`rates` would say; on the path in few substeps, and few paths if far off."""
+        if not self.at_path:
+            return self.rates(plan, episodes, seed)[0]
         substeps = min(_SUBSTEPS, self.substeps)
         return self._coarse * self._rates(plan, episodes, seed, substeps, target / self._coarse)[0]
 

@@ -38,6 +38,8 @@ _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
 _SEARCH_SEED, _VERIFICATION_SEED = 0x51EE, 0xF5E5
 #: Standard deviations of Monte Carlo that the search keeps below δ, and verifications at most.
 _CAUTION, _VERIFICATIONS = 1.5, 3
+#: How far below its target, relatively, a rate of the search may stay.
+_NEAR, _NEAR_ON_PATH = 0.15, 0.08
 #: With fewer violations expected among the paths, Boole's bound is searched with instead.
 _COUNTABLE = 10
 #: Boole's bound overestimates, as nodes are correlated, by less than this.
@@ -261,6 +263,7 @@ class _Calibration:
             target=self._target,
             start=price,
             largest=_DEAREST * price,
+            tolerance=_NEAR_ON_PATH if self._counting.at_path else _NEAR,
             resolution=1.0 / self._paths if self._countable else 0.0,
         )
         for trial in search.tried:
