@@ -3,9 +3,9 @@
 Between two Euler–Maruyama nodes a and b, h apart, the continuous path is a Brownian bridge round
 the chord, with the diffusion of the step: D = σσᵀ of the position at a. It enters a half plane
 whose border both ends keep away from, by d_a and d_b, with probability exp(−2 d_a d_b / (h nᵀDn)),
-n the normal (:mod:`slipcar.planner.moments.bridge`, the same for the planner's promises). Of the half planes that touch an obstacle's
-rim the one with the largest d_a d_b / nᵀDn counts; that the rim curves away from it, with radius
-δ, is worth a factor:
+n the normal (:mod:`slipcar.planner.moments.bridge`: the planner's promises have it too). Of the
+half planes that touch an obstacle's rim the one with the largest d_a d_b / nᵀDn counts; that the
+rim curves away from it, with radius δ, is worth a factor:
 
     q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ (d_a + d_b)))
 

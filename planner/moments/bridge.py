@@ -36,6 +36,7 @@ def crossing(a: Any, b: Any, variance: Any) -> Any:
         b: at the end.
         variance: V ≥ 0 of the step between them.
     """
-    q = np.exp(-2.0 * (a * b) / larger(variance, _NONE + 0.0 * a))
+    away = choose(a, choose(b, a * b, 0.0 * a), 0.0 * a)  # never the exponential of much
+    q = np.exp(-2.0 * away / larger(variance, _NONE + 0.0 * a))
     one = 1.0 + 0.0 * a
     return choose(a, choose(b, q, one), one)

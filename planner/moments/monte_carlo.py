@@ -222,12 +222,13 @@ class _Strand:
 
     def move(self, t: float, h: float, u: Array, noise: Array) -> None:
         """One substep, its bridges charged."""
-        model, middle, end = self._model, np.full(BLOCK, t + 0.5 * h), np.full(BLOCK, t + h)
-        x = self.x + change(model.integrator, model.drift, np.full(BLOCK, t), 0.5 * h, self.x, u)
+        model, half = self._model, np.full(BLOCK, 0.5 * h)
+        begin, middle, end = (np.full(BLOCK, t + part * h) for part in (0.0, 0.5, 1.0))
+        x = self.x + change(model.integrator, model.drift, begin, half, self.x, u)
         sigma = model.diffusion(middle, x)
         pushed = np.asarray(model.jacobians.state("constraint", middle, x)) @ sigma
         x = x + np.einsum("bij,bj->bi", sigma, np.sqrt(h) * noise)
-        x = x + change(model.integrator, model.drift, middle, 0.5 * h, x, u)
+        x = x + change(model.integrator, model.drift, middle, half, x, u)
         before, self.x, self.gap = self.gap, x, _gaps(model, end, x)
         q = crossing(before, self.gap, h * (pushed * pushed).sum(axis=-1))
         self.whole = (self.gap >= 0.0).all(axis=1)  # NaN is a violation
