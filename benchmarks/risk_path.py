@@ -1,7 +1,11 @@
-"""Promises on the path: what they cost over promises at nodes, and whether they are kept."""
+"""Promises on the path: what they cost over promises at nodes, and whether they are kept.
+
+python benchmarks/risk_path.py [--episodes 20000] [--worlds 10]
+"""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 import statistics
@@ -9,6 +13,7 @@ import time
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from report import Section
 
 from slipcar.envs import Scenario
@@ -45,12 +50,13 @@ class Row:
     at: str
     plan: Plan
     judged: float
+    episodes: int
     seconds: float
 
     @property
     def error(self) -> float:
         """Standard error of a rate of δ."""
-        return float(np.sqrt(self.delta / EPISODES))
+        return float(np.sqrt(self.delta / self.episodes))
 
     @property
     def reached(self) -> bool:
@@ -106,7 +112,8 @@ def measure(worlds: int = WORLDS, episodes: int = EPISODES) -> list[Row]:
         began = time.perf_counter()
         p = plan(scene, risk=delta, risk_at=at, feedback=feedback)
         seconds = time.perf_counter() - began
-        rows.append(Row(name, feedback, delta, at, p, judge(p, scene, episodes), seconds))
+        rate = judge(p, scene, episodes)
+        rows.append(Row(name, feedback, delta, at, p, rate, episodes, seconds))
         print(rows[-1].columns(), flush=True)
     return rows
 
@@ -157,3 +164,18 @@ def section() -> Section:
         },
         notes=(note,),
     )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="paths that judge a plan")
+    parser.add_argument(
+        "--worlds", type=int, default=WORLDS, help="random ones, beside the paper's"
+    )
+    options = parser.parse_args()
+    rows = summary(measure(options.worlds, options.episodes))
+    print(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
+
+
+if __name__ == "__main__":
+    main()
