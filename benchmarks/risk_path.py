@@ -33,7 +33,8 @@ The scenario `paper` and `Scenario.random(seed)` for the seeds 0 to {WORLDS - 1}
 with feedback. *Judged* is the rate at which the SDE itself collides at any instant, on
 {EPISODES:,} paths that no planner has met: Euler's method in {SUBSTEPS} substeps of every control
 interval, Brownian bridges between them. A promise is *broken* where that rate is above δ by more
-than two of its standard errors. *Effort* and *total* are expected, with what feedback spends;
+than two of its standard errors; where δ is out of reach (`RISK_UNREACHABLE`) there is no promise.
+*Effort* and *total* are expected, with what feedback spends;
 *over* is how much more the promise on the path expects to spend than the promise at nodes,
 effort and corrections together. *Seconds* are of the whole call, Monte Carlo included, on the
 threads that the machine has; *planning* is what is not Monte Carlo [ms].
@@ -124,6 +125,7 @@ def summary(rows: list[Row]) -> list[dict[str, Any]]:
     for feedback, delta in itertools.product((False, True), RISKS):
         mine = [r for r in rows if (r.feedback, r.delta) == (feedback, delta)]
         nodes, path = ([r for r in mine if r.at == at] for at in ("nodes", "path"))
+        kept = {at: [r.kept for r in mine if r.at == at and r.reached] for at in ("nodes", "path")}
         over = [
             b.spent / a.spent - 1.0
             for a, b in zip(nodes, path, strict=True)
@@ -131,9 +133,9 @@ def summary(rows: list[Row]) -> list[dict[str, Any]]:
         ]
         table.append({
             "law": "feedback" if feedback else "open loop", "δ": f"{delta:.1%}",
-            "kept, promised at nodes": f"{sum(r.kept for r in nodes)} of {len(nodes)}",
+            "kept, promised at nodes": f"{sum(kept['nodes'])} of {len(kept['nodes'])}",
             "worst": f"{max(r.judged / delta for r in nodes if r.reached):.1f} δ",
-            "kept, promised on the path": f"{sum(r.kept for r in path)} of {len(path)}",
+            "kept, promised on the path": f"{sum(kept['path'])} of {len(kept['path'])}",
             "worst ": f"{max((r.judged / delta for r in path if r.reached), default=0.0):.2f} δ",
             "out of reach": sum(not r.reached for r in path),
             "over, median": f"{statistics.median(over):+.1%}" if over else "",
