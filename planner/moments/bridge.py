@@ -36,7 +36,11 @@ def crossing(a: Any, b: Any, variance: Any) -> Any:
         b: at the end.
         variance: V ≥ 0 of the step between them.
     """
-    away = choose(a, choose(b, a * b, 0.0 * a), 0.0 * a)  # never the exponential of much
-    q = np.exp(-2.0 * away / larger(variance, _NONE + 0.0 * a))
-    one = 1.0 + 0.0 * a
-    return choose(a, choose(b, q, one), one)
+    return np.exp(exponent(a, b, variance))
+
+
+def exponent(a: Any, b: Any, variance: Any) -> Any:
+    """−2 a b / V of :func:`crossing`; 0 where an end is not above the border."""
+    nothing = 0.0 * a
+    away = choose(a, choose(b, a * b, nothing), nothing)
+    return -2.0 * away / larger(variance, _NONE + nothing)

@@ -14,19 +14,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slipcar.planner.moments.bridge import crossing
+from slipcar.planner.moments.bridge import exponent
 from slipcar.planner.moments.monte_carlo import BLOCK, Kept, Law, block_generator, block_starts
 from slipcar.planner.newton.posing import Posed
 from slipcar.planner.newton.program import called_with
 from slipcar.planner.newton.quantities import Traced
 from slipcar.planner.trace import emit, machine_code
-from slipcar.planner.trace.elementwise import choose, magnitude, within
+from slipcar.planner.trace.elementwise import choose, larger, magnitude, within
 from slipcar.planner.trace.recursion import Carried, Field, Recursion
 
 Array = np.ndarray
 Rows = Any
 #: Beyond it a state is lost.
 _HUGE = 1e300
+#: Bridges touch with the exponential of it, or less, by chance: never.
+_NEVER = -40.0
 _lock = threading.Lock()
 
 
@@ -42,15 +44,20 @@ class _Kernels:
             "mean": Field((n,), True), "nominal": Field((m,), True), "gains": Field((m, n), True),
             "lower": Field((m,), True), "upper": Field((m,), True), "node": Field((), True),
             "x": Field((n,)), "u": Field((m,)), "noise": Field((dims.d,)),
+            "exponent": Field((tails,)), "worst": Field((), True),
             "gap": Field((tails,)), "variance": Field((tails,)), "kept": Field((2,)),
         }  # fmt: skip
 
     @property
     def recursions(self) -> list[Recursion]:
-        """`law` answers to states, `look` charges what was passed, the others go on."""
-        steps = {"law": self._law, "look": self._look, "chain": self._chain, "drift": self._drift,
+        """`law` answers to states, `look` and `charge` see what was passed, the others go on."""
+        steps = {"law": self._law, "chain": self._chain, "charge": self._charge,
                  "kick": self._kick, "glide": self._glide}  # fmt: skip
-        return [Recursion(name, step, lambda rows: {}) for name, step in steps.items()]
+        looks = {"look": self._look, "drift": self._drift}
+        return [
+            *(Recursion(name, step, lambda rows: {}) for name, step in steps.items()),
+            *(Recursion(name, step, _unharmed, _worst) for name, step in looks.items()),
+        ]
 
     def _law(self, rows: Rows, carried: Carried) -> Carried:
         error = rows["x"] - rows["mean"]
@@ -81,22 +88,31 @@ class _Kernels:
         return {}
 
     def _look(self, rows: Rows, carried: Carried) -> Carried:
-        """Charge the bridge that ends at x."""
+        """The bridge that ends at x, to be charged if one of a block comes near a border."""
         kept, here, gap = rows["kept"], self._whole(rows), -self._constraints()
-        clear: Any = here
-        for q in crossing(rows["gap"], gap, rows["variance"]):
-            clear = clear * (1.0 - q)
+        powers, worst = exponent(rows["gap"], gap, rows["variance"]), carried["worst"]
         rows.write("gap", gap)
-        clear = choose(clear, kept[0] * clear, 0.0)
+        rows.write("exponent", powers)
         seen = choose(rows["node"], kept[1] * here, kept[1])
-        rows.write("kept", np.array([clear, seen], dtype=object))
+        rows.write("kept", np.array([kept[0] * here, seen], dtype=object))
+        for power in powers:
+            worst = larger(power, worst)
+        return {"worst": worst}
+
+    def _charge(self, rows: Rows, carried: Carried) -> Carried:
+        """What bridges leave."""
+        kept = rows["kept"]
+        clear = kept[0]
+        for q in np.exp(rows["exponent"]):
+            clear = clear * (1.0 - q)
+        rows.write("kept", np.array([clear, kept[1]], dtype=object))
         return {}
 
     def _drift(self, rows: Rows, carried: Carried) -> Carried:
-        """Charge the bridge that ends at x, and begin the next substep: half of its drift."""
-        self._look(rows, carried)
+        """Look, and begin the next substep: half of its drift."""
+        worst = self._look(rows, carried)
         rows.write("x", self.problem.next)
-        return {}
+        return worst
 
     def _kick(self, rows: Rows, carried: Carried) -> Carried:
         """The noise of a substep, twice dt long, at its middle."""
@@ -117,6 +133,14 @@ class _Kernels:
         key = repr(("paths", structure, self.problem.dims, self.tails, self.angles)).encode()
         assembly = functools.partial(emit.module, recursions, self.problem.graph, self.layout, {})
         return machine_code.code(key, [r.name for r in recursions], assembly)
+
+
+def _unharmed(rows: Rows) -> Carried:
+    return {"worst": -_HUGE}
+
+
+def _worst(rows: Rows, carried: Carried) -> None:
+    rows.write("worst", carried["worst"])
 
 
 class _Block(NamedTuple):
@@ -202,6 +226,7 @@ class CompiledPaths:
         for arrays, run, _ in blocks:
             arrays["t"][:], arrays["node"][:] = model.times[-1], 1.0
             run["look"]()
+            run["charge"]()
         return [Kept(*arrays["kept"].T.copy()) for arrays, _, _ in blocks]
 
     @staticmethod
@@ -209,6 +234,8 @@ class CompiledPaths:
         arrays, run = block.arrays, block.run
         arrays["t"][:], arrays["dt"][:], arrays["node"][:] = t, 0.5 * h, node
         run["drift"]()
+        if arrays["worst"][0, 0] > _NEVER:
+            run["charge"]()
         arrays["t"][:] = t + 0.5 * h
         run["kick"]()
         run["glide"]()
