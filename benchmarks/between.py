@@ -15,9 +15,7 @@ import numpy as np
 from slipcar.envs import Scenario
 from slipcar.evaluation import evaluate, sample_paths
 from slipcar.planner import OpenLoop, plan
-
-#: −ζ(1/2) / √(2π): how far a discrete walk overshoots, in standard deviations of its steps.
-_OVERSHOOT = 0.5826
+from slipcar.planner.moments.bridge import OVERSHOOT
 
 
 def main() -> None:
@@ -40,7 +38,7 @@ def main() -> None:
             left = scenario.dt - j * dt
             step = deviation * np.sqrt(dt * (left - dt) / left)
             r[:, :2] += (end - r[:, :2]) * dt / left + step[:, None] * rng.normal(size=end.shape)
-            hit |= scenario.signed_distance(r) < _OVERSHOOT * deviation * np.sqrt(dt)
+            hit |= scenario.signed_distance(r) < OVERSHOOT * deviation * np.sqrt(dt)
     error = np.sqrt(hit.mean() * (1.0 - hit.mean()) / options.episodes)
     formula = evaluate(controller, scenario, options.episodes, options.seed).between_rate
     print(

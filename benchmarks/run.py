@@ -23,6 +23,7 @@ import peers
 import planners
 import report
 import risk_paper
+import risk_path
 import risk_times
 import risk_worlds
 import simulation
@@ -32,14 +33,16 @@ import worlds
 
 PARTS = ("planners", "growth", "cold", "simulation", "environment", "risk_times")
 #: Minutes; on request.
-LONG_PARTS = ("worlds", "systems", "risk_paper", "risk", "live_page", "control_loop", "c_law")
+LONG_PARTS = (
+    "worlds", "systems", "risk_paper", "risk_path", "risk", "live_page", "control_loop", "c_law",
+)  # fmt: skip
 #: Pages of the docs: file, heading and parts.
 PAGES = (
     ("benchmarks.md", "Benchmarks", ("planners", "growth", "cold", "simulation", "worlds")),
     (
         "benchmarks-risk.md",
         "Benchmarks: risk, feedback, receding horizon",
-        ("risk_paper", "risk_times", "risk"),
+        ("risk_paper", "risk_path", "risk_times", "risk"),
     ),
     ("benchmarks-systems.md", "Benchmarks: users' systems", ("systems",)),
     (
@@ -67,6 +70,7 @@ def main() -> None:
         "live_page": live_page.section,
         "control_loop": control_loop.section,
         "c_law": c_law.section,
+        "risk_path": risk_path.section,
         "risk": functools.partial(risk_worlds.section, arguments.risk_worlds, folder),
     }
     for part in arguments.only:

@@ -1,11 +1,11 @@
 """Collisions between nodes: how likely a path touches an obstacle where no node looks.
 
 Between two Euler–Maruyama nodes a and b, h apart, the continuous path is a Brownian bridge round
-the chord, with the diffusion of the step: D = σσᵀ of the position at a. By the reflection
-principle it enters a half plane whose border both ends keep away from, by d_a and d_b, with
-probability exp(−2 d_a d_b / (h nᵀDn)), n the normal. Of the half planes that touch an obstacle's
-rim the one with the largest d_a d_b / nᵀDn counts; that the rim curves away from it, with radius
-δ, is worth a factor:
+the chord, with the diffusion of the step: D = σσᵀ of the position at a. It enters a half plane
+whose border both ends keep away from, by d_a and d_b, with probability exp(−2 d_a d_b / (h nᵀDn)),
+n the normal (:mod:`slipcar.planner.moments.bridge`: the planner's promises have it too). Of the
+half planes that touch an obstacle's rim the one with the largest d_a d_b / nᵀDn counts; that the
+rim curves away from it, with radius δ, is worth a factor:
 
     q = exp(−2 d_a d_b / (h nᵀDn)) / √(1 + 2 d_a d_b / (δ (d_a + d_b)))
 
@@ -28,6 +28,7 @@ import numpy as np
 
 from slipcar.envs import car
 from slipcar.envs.scenario import Scenario
+from slipcar.planner.moments.bridge import crossing
 
 #: Bridges that would have to stray so many standard deviations are left out: q < 1e-13.
 _FAR = 4.0
@@ -142,9 +143,8 @@ def _touched(
         determinant = np.maximum(variance_x * variance_y, 1e-300)[uneven]
         radius = radius.copy()
         radius[uneven] *= variance[uneven] ** 2 / determinant
-    # Without noise the path is the chord: exp(−∞).
+    straight = crossing(gap_a, gap_b, variance)  # without noise the path is the chord: 0
     with np.errstate(divide="ignore", invalid="ignore"):
-        straight = np.exp(-2.0 * product / variance)
         bend = np.sqrt(1.0 + 2.0 * product / (radius * (gap_a + gap_b)))
         return np.where(clear, straight / bend, 1.0)
 

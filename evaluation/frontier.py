@@ -91,7 +91,8 @@ def frontier(
         receding_episodes: its episodes a point, >= 1, but at most `episodes`: the first of the
             same Brownian paths.
         policy: the PPO point; None takes the shipped one, where it was trained for the scenario.
-        substeps: Euler–Maruyama steps in each control interval.
+        substeps: Euler–Maruyama steps in each control interval. With more than one, prices are of
+            the risk on the path, `plan(..., risk_at="path")`.
         n_jobs: worker processes; the numbers do not depend on it.
         folder: where finished points are kept, so that an interrupted run continues; or None.
         resume: whether to reuse finished points of `folder`.
@@ -113,6 +114,7 @@ def frontier(
         checked_prices("prices", prices),
         checked_prices("receding_prices", receding_prices),
         policy,
+        at_path=substeps > 1,
     )
 
     def run(chosen: list[Point], count: int) -> Comparison:
@@ -151,8 +153,13 @@ def candidates(
     prices: Sequence[float],
     receding_prices: Sequence[float],
     policy: Controller | None,
+    *,
+    at_path: bool = False,
 ) -> tuple[list[Point], list[str]]:
-    """The points, and what a reader must be told; plans that did not converge are left out."""
+    """The points, and what a reader must be told; plans that did not converge are left out.
+
+    Prices are of the risk at nodes, or on the path; see :func:`frontier`.
+    """
     scenario.action_scale  # noqa: B018  raises now if it is unbounded
     notes: list[str] = []
     weight = makers.chargeable(scenario)
@@ -177,7 +184,8 @@ def candidates(
     for method, play, feedback in kinds:
         for price in prices:
             name = point_name(method, price)
-            found = plan(scenario, risk_price=price, feedback=feedback)
+            promised = "path" if at_path else "nodes"
+            found = plan(scenario, risk_price=price, risk_at=promised, feedback=feedback)
             if found.status.ok:
                 points.append(Point(name, method, price, play(found)))
             notes += rows.plan_notes(name, found)

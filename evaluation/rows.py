@@ -24,6 +24,8 @@ OPEN_RISK, FEEDBACK_RISK = 0.01, 0.001
 CHANCE = f"SCP, risk ≤ {100 * OPEN_RISK:g} %"
 STEERED = "planned feedback"
 STEERED_CHANCE = f"planned feedback, risk ≤ {100 * FEEDBACK_RISK:g} %"
+#: The same at any instant of the SDE, where a finer simulation can tell.
+PATH_CHANCE, STEERED_PATH_CHANCE = f"{CHANCE} on the path", f"{STEERED_CHANCE} on the path"
 RECEDING = "receding horizon"
 RECEDING_MARGINS = "receding horizon with margins"
 #: Price of risk where none could be calibrated [cost per unit of probability].
@@ -38,6 +40,7 @@ def default_rows(
     variance_weight: float = 1.0,
     policy: Controller | None = None,
     only: Sequence[str] = (),
+    substeps: int = 1,
 ) -> tuple[dict[str, Controller | Runs], list[str]]:
     """Controllers by name, in the order of the table, and what a reader must be told of them.
 
@@ -54,11 +57,15 @@ def default_rows(
             expected to cost, and need none.
         policy: the only learned row; None takes all that are shipped.
         only: names or patterns of the rows wanted (:func:`chosen`); nothing else is planned.
+        substeps: of the simulation. Risks are promised at nodes of the planner's chain; with
+            several substeps rows are added that promise them at any instant of the SDE.
 
     Raises:
         ValueError: for a scenario that cannot be driven or planned, or an unknown row.
     """
-    makers, notes = row_makers(scenario, variance_weight=variance_weight, policy=policy)
+    makers, notes = row_makers(
+        scenario, variance_weight=variance_weight, policy=policy, substeps=substeps
+    )
     names = chosen(list(makers), only)
     return {name: makers[name]() for name in names}, notes
 
@@ -87,6 +94,7 @@ def row_makers(
     *,
     variance_weight: float = 1.0,
     policy: Controller | None = None,
+    substeps: int = 1,
 ) -> tuple[dict[str, Callable[[], Controller | Runs]], list[str]]:
     """What makes each of :func:`default_rows`; making one plans no more than it needs.
 
@@ -108,6 +116,10 @@ def row_makers(
         CHANCE: lambda: plan(scenario, risk=OPEN_RISK),
         STEERED: lambda: plan(scenario, feedback=True),
         STEERED_CHANCE: lambda: plan(scenario, feedback=True, risk=FEEDBACK_RISK),
+        PATH_CHANCE: lambda: plan(scenario, risk=OPEN_RISK, risk_at="path"),
+        STEERED_PATH_CHANCE: lambda: plan(
+            scenario, feedback=True, risk=FEEDBACK_RISK, risk_at="path"
+        ),
     }
 
     @functools.cache
@@ -116,6 +128,9 @@ def row_makers(
             planned[name]()  # so that the times in the table are warm ones
         made = planned[name]()
         notes.extend(plan_notes(name, made))
+        if made.risk is not None and made.risk.at == "path" and made.status.ok:
+            nodes = made.risk.verified_at_nodes or 0.0
+            notes.append(f"{name}: {made.risk}; at nodes of the same paths {nodes:.3%}.")
         return made
 
     def with_margins() -> Controller:
@@ -124,6 +139,10 @@ def row_makers(
         return RecedingHorizon(scenario, risk_price=price)
 
     learners = learned(scenario, policy, notes)
+    on_path: dict[str, Callable[[], Controller | Runs]] = {
+        PATH_CHANCE: lambda: OpenLoop(found(PATH_CHANCE)),
+        STEERED_PATH_CHANCE: lambda: Feedback(found(STEERED_PATH_CHANCE)),
+    }
     return {
         STRAIGHT: lambda: baselines.straight(scenario),
         DETERMINISTIC: lambda: OpenLoop(found(DETERMINISTIC)),
@@ -135,6 +154,7 @@ def row_makers(
         STEERED_CHANCE: lambda: Feedback(found(STEERED_CHANCE)),
         RECEDING: lambda: RecedingHorizon(scenario),
         RECEDING_MARGINS: with_margins,
+        **(on_path if substeps > 1 else {}),
     }, notes
 
 

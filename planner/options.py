@@ -50,7 +50,8 @@ class Options:
             linearises the obstacle cost whole, as the paper writes it.
         terminal_tolerance: half-width of a box round E g = 0; 0 asks for equality.
         integrator: of the mean: `"euler"` (the paper's) or `"rk4"`; controls are constant on each
-            interval either way. See :mod:`slipcar.planner.problem.integrators`.
+            interval either way. In `plan`, None is `"euler"`, with `risk_at="path"` `"rk4"`.
+            See :mod:`slipcar.planner.problem.integrators`.
         compiled: run Newton's method as machine code. None: where llvmlite is installed; False
             never compiles, the same steps in NumPy; True insists, and refuses functions that
             cannot be traced.

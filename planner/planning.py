@@ -53,7 +53,7 @@ def plan(
     trust_region: TrustRegionName | None = None,
     linearization: Linearization = "composite",
     terminal_tolerance: float = 0.0,
-    integrator: IntegratorName = "euler",
+    integrator: IntegratorName | None = None,
     compiled: bool | None = None,
     starts: int | None = None,
     guess: Plan | tuple[Array, Array] | None = None,
@@ -64,6 +64,7 @@ def plan(
     time_weight: float = 1.0,
     final_time_bounds: tuple[float, float] | None = None,
     risk: float | None = None,
+    risk_at: str = "nodes",
     risk_price: float | None = None,
     risk_episodes: int = 100_000,
     feedback: bool = False,
@@ -102,6 +103,8 @@ def plan(
         )
     if variance_weight is None:
         asked["variance_weight"] = 0.0 if request.wanted else 1.0
+    if integrator is None:
+        asked["integrator"] = "rk4" if request.on_path else "euler"
     if shooting and method == "auto":
         asked["method"] = "convex"
     with np.errstate(all="ignore"):
@@ -230,6 +233,7 @@ class _Planning:
             "time_weight": float(guesses.time_weight) if guesses.free_final_time else None,
             "final_time_bounds": None if self.bounds is None else list(self.bounds),
             "risk": request.risk,
+            "risk_at": request.risk_at,
             "risk_price": request.risk_price,
             "risk_episodes": int(request.risk_episodes),
             "feedback": bool(request.feedback),

@@ -98,7 +98,9 @@ def compare(
         trust: load Stable-Baselines3 models, which runs whatever code is in the file.
         variance_weight: weight of the integral of tr Sigma in stochastic SCP [1/(m2 s)].
         policy: a trained policy (.safetensors file or folder) instead of the shipped ones.
-        substeps: Euler-Maruyama steps in each control interval.
+        substeps: Euler-Maruyama steps in each control interval. With more than one the table
+            nears the SDE, and has rows whose risk is promised on the path, beside those that
+            promise it at nodes.
         workers: processes on this machine that share the work; the numbers do not depend on it.
         cluster: who does the work instead: dask (a Dask cluster of so many workers on this
             machine), dask://HOST:PORT or dask+tls://HOST:PORT (a running scheduler).
@@ -194,6 +196,7 @@ def _paper(
     own = dict(read_maker(text, trust) for text in controllers)
     learned = None if policy is None else load_policy(policy)
     how: dict[str, Any] = {"variance_weight": variance_weight, "policy": learned}
+    how["substeps"] = options["substeps"]
     names = usual.chosen(list(usual.row_makers(world, **how)[0]), rows)
     against = _reference(reference, usual.REFERENCE, [*names, *own])
     check_names(names, list(own), len(controllers))

@@ -56,7 +56,8 @@ def frontier(
         receding_prices: the same for the receding horizon.
         receding_episodes: per point of the receding horizon, which takes most of the time.
         policy: a trained policy (.safetensors file or folder) instead of the shipped one.
-        substeps: Euler-Maruyama steps in each control interval.
+        substeps: Euler-Maruyama steps in each control interval. With more than one, prices are of
+            the risk on the path.
         workers: processes that share each point's episodes; the numbers do not depend on it.
         figures: draw the figure as well (needs matplotlib).
         resume: reuse finished points found in the folder.

@@ -23,7 +23,7 @@ def plan(
     guess: Path | None = None,
     method: Literal["auto", "newton", "convex"] = "auto",
     compiled: Literal["auto", "yes", "no"] = "auto",
-    integrator: Literal["euler", "rk4"] = "euler",
+    integrator: Literal["euler", "rk4"] | None = None,
     tolerance: float = 1e-4,
     max_iterations: int = 200,
     shooting: bool = False,
@@ -35,6 +35,7 @@ def plan(
     linearization: Literal["composite", "literal"] = "composite",
     terminal_tolerance: float = 0.0,
     risk: float | None = None,
+    risk_at: Literal["nodes", "path"] = "nodes",
     risk_price: float | None = None,
     risk_episodes: int = 100_000,
     feedback: bool = False,
@@ -57,6 +58,7 @@ def plan(
         slipcar plan --tolerance 1e-10 --figures figures
         slipcar plan --scenario random:7 --starts 8 --save plan.npz
         slipcar plan --risk 0.01
+        slipcar plan --risk 0.01 --risk-at path
         slipcar plan --feedback --risk 0.001 --figures figures --save plan.npz
         slipcar plan --free-final-time --time-weight 2
         slipcar plan --method convex --shooting --tolerance 1e-12
@@ -80,7 +82,7 @@ def plan(
         compiled: Newton's method as machine code, made from the scenario's functions; auto: where
             that is possible; yes says what is in the way, if anything; no takes the same steps in
             NumPy, a few hundred times slower.
-        integrator: of the mean; euler is the paper's.
+        integrator: of the mean; euler is the paper's, and the default but with --risk-at path.
         tolerance: stop when the square of the maximum principle's relative residual falls to this.
         max_iterations: give up after so many.
         shooting: end the convex method by Newton's method on the maximum principle, to 1e-12.
@@ -93,7 +95,9 @@ def plan(
             at each iteration.
         linearization: of the obstacle cost; literal is as the paper prints it, and implies convex.
         terminal_tolerance: half-width of a box round the terminal condition; > 0 implies convex.
-        risk: the probability of any collision on the path must not exceed this, in (0, 1).
+        risk: the probability of any collision must not exceed this, in (0, 1).
+        risk_at: where it is promised: at any node of the discretised chain, or on the path, at any
+            instant of the stochastic differential equation; then --integrator is rk4.
         risk_price: add this cost per unit of collision probability, without Monte Carlo.
         risk_episodes: fresh paths that verify the risk.
         feedback: plan gains too, for the least expected cost.
@@ -138,6 +142,7 @@ def plan(
         "linearization": linearization,
         "terminal_tolerance": terminal_tolerance,
         "risk": risk,
+        "risk_at": risk_at,
         "risk_price": risk_price,
         "risk_episodes": risk_episodes,
         "feedback": feedback,

@@ -174,7 +174,8 @@ def tables(comparison: ComparisonRecord, brief: bool = False) -> tuple[Table, ..
         ),
         (
             "Collisions: at a node, and at or between nodes (Brownian bridges between them); "
-            "Wilson 95 % intervals",
+            "Wilson 95 % intervals. Risks are promised at nodes, and on the path where a name "
+            "says so",
             BETWEEN,
         ),
         (

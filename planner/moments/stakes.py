@@ -24,6 +24,7 @@ class Stakes:
         feedback: whether u = ū + K (x − μ), with the gains that make the whole cheapest.
         variance_weight: w.
         saturation: control bounds are kept at so many standard deviations of the correction.
+        bridged: whether constraints are to hold between nodes too.
         renewal: how much of a change of the rows' weights an iteration takes over, in (0, 1].
     """
 
@@ -35,6 +36,7 @@ class Stakes:
     feedback: bool
     variance_weight: float
     saturation: float = 1.0
+    bridged: bool = False
     renewal: float = 0.5
 
     @property

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slipcar.planner.lq import riccati
+from slipcar.planner.moments.bridge import OVERSHOOT
 from slipcar.planner.moments.losses import (
     Loss,
     floored,
@@ -162,11 +163,14 @@ class Form:
         noisy: rows are Gaussian and gains may be planned; otherwise the mean's.
         soft: the end is charged gᵀWg instead of fixed.
         tails: how many rows, the last ones, are constraints charged by their tail.
+        bridged: tails are of the path between nodes: their border is nearer by what a walk that is
+            looked at after every interval misses (:mod:`slipcar.planner.moments.bridge`).
     """
 
     noisy: bool = False
     soft: bool = False
     tails: int = 0
+    bridged: bool = False
 
 
 #: The other one of a pair of points has this behind the names of its arrays.
@@ -669,6 +673,10 @@ class Equations:
         """Write ½ tr(∂²c Σ) and (C Σ Cᵀ)^½ of the rows; the largest deviations so far (p,)."""
         p, C, on = self.problem.at(rows), rows["C"], choose(rows["dn"], 1.0, 0.0)
         offset = [0.5 * np.sum(bend * S) for bend in p.row_hessians]
+        if self.form.bridged:
+            for i in range(self.dims.p - self.form.tails, self.dims.p):
+                pushed = C[i].dot(p.sigma)
+                offset[i] = offset[i] + OVERSHOOT * np.sqrt(rows["dn"] * pushed.dot(pushed))
         s = [np.sqrt(positive_part(row.dot(S).dot(row))) for row in C]
         rows.write("offset", np.array(offset, dtype=object))
         rows.write("s", np.array(s, dtype=object))

@@ -236,7 +236,9 @@ class Steered:
 
 def form_of(posed: Posed, stakes: Stakes) -> Form:
     """Which equations charge what is at stake."""
-    return Form(noisy=True, soft=stakes.soft, tails=posed.tails)
+    return Form(
+        noisy=True, soft=stakes.soft, tails=posed.tails, bridged=stakes.bridged and posed.tails > 0
+    )
 
 
 def task_of(

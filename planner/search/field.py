@@ -81,7 +81,7 @@ class Field:
         self._alive = list(range(len(candidates)))
 
     @functools.cached_property
-    def _guarded(self) -> Posed:
+    def guarded(self) -> Posed:
         """The problem with its constraints as rows."""
         return pose(self._model, constraints=True, compiled=self._options.compiled)
 
@@ -125,7 +125,7 @@ class Field:
             return 0.0
         c, s = plan.c, plan.s
         if c.shape[1] != tails + len(self._stakes.penalties):
-            c, s = self._guarded.row_moments(plan.x, plan.covariance)
+            c, s = self.guarded.row_moments(plan.x, plan.covariance)
         return min(1.0, float(normal_cdf(c[:, -tails:] / s[:, -tails:]).sum()))
 
     def _steered(self, i: int, price: float, stakes: Stakes) -> Steered:
@@ -141,7 +141,7 @@ class Field:
     def _run(self, i: int, stakes: Stakes, warm: Steered | None) -> Steered:
         start = self._candidates[i] if warm is None else warm
         plan = solve_noise(
-            self._guarded if stakes.priced else self._free, stakes, start.x, start.u,
+            self.guarded if stakes.priced else self._free, stakes, start.x, start.u,
             tolerance=self._options.tolerance, max_iterations=self._options.max_iterations,
             warm=None if warm is None else _with_rows(warm, len(stakes.weight)),
         )  # fmt: skip

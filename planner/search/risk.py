@@ -1,6 +1,9 @@
 """The risk of a plan: what was asked for, what the planner predicted, what paths show.
 
-    risk = P( constraint(t_k, x_k) > 0 in any row at any node k = 1..N−1 )
+    at nodes     P( constraint(t_k, x_k) > 0 in any row at any node k = 1..N−1 ) of the discretised
+                 chain, with steps of the plan's own integrator: the paper's definition
+    on the path  P( constraint(t, x_t) > 0 in any row at any t in [0, T] ) of the SDE itself, the
+                 controls held between nodes
 
 `predicted` is Boole's bound on Gaussian marginals, `verified` a Monte-Carlo rate; between them
 the *price of risk* ν, the cost per unit of probability that the planner minimises with, is
@@ -19,6 +22,11 @@ from typing import Any
 CONFIDENCE = 0.95
 
 
+#: What a promise may be about, and how it is called.
+_WHERE = {"nodes": "at nodes", "path": "on the path"}
+PROMISES = tuple(_WHERE)
+
+
 @dataclasses.dataclass(frozen=True)
 class PricedRate:
     """One price tried on the way."""
@@ -32,7 +40,7 @@ class PricedRate:
 
 @dataclasses.dataclass(frozen=True)
 class Risk:
-    """Three answers to how often a path of the plan breaks a constraint at some node."""
+    """Three answers to how often a path of the plan breaks a constraint."""
 
     requested: float  #: δ, the probability not to be exceeded
     #: Σ_{k,i} Φ(h_{k,i} / s_{k,i}), at most 1: h the constraint at the mean, s its standard
@@ -46,11 +54,17 @@ class Risk:
     reached: bool  #: whether a price was found that keeps δ; if not, the plan is that of least risk
     tried: tuple[PricedRate, ...]  #: the prices tried, in order
     simulation_time: float  #: seconds spent on Monte Carlo, search and verification together
+    #: what is promised and verified: `"nodes"` of the plan's own chain, or the `"path"` of the SDE
+    at: str = "nodes"
+    substeps: int = 1  #: of each interval, in verification
+    #: rate at nodes over the same paths, of the SDE where the promise is about the path
+    verified_at_nodes: float | None = None
 
     def __str__(self) -> str:
         low, high = self.interval
         return (
-            f"risk {self.verified:.3%} [{low:.3%}, {high:.3%}] on {self.episodes:,} fresh paths; "
+            f"risk {_WHERE[self.at]} {self.verified:.3%} [{low:.3%}, {high:.3%}] on "
+            f"{self.episodes:,} fresh paths; "
             f"requested {self.requested:.3%}{'' if self.reached else ' (not reached)'}, "
             f"predicted {self.predicted:.3%}, price {self.price:.4g}"
         )

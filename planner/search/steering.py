@@ -10,23 +10,21 @@ until simulated paths keep δ (:mod:`.price_search`, :mod:`slipcar.planner.momen
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from slipcar.planner.moments.gains import wrap
-from slipcar.planner.moments.monte_carlo import violations
 from slipcar.planner.moments.stakes import Stakes
 from slipcar.planner.newton.running import Steered
-from slipcar.planner.options import Options, check_count, check_flag, check_number
+from slipcar.planner.options import Options, check_choice, check_count, check_flag, check_number
 from slipcar.planner.outcome import Outcome
 from slipcar.planner.problem.model import Model
 from slipcar.planner.records import ExpectedCost
+from slipcar.planner.search.counting import Counting
 from slipcar.planner.search.field import Field
-from slipcar.planner.search.price_search import search_price
-from slipcar.planner.search.risk import PricedRate, Risk, check_risk, wilson_interval
+from slipcar.planner.search.price_search import PriceSearch, search_price
+from slipcar.planner.search.risk import PROMISES, PricedRate, Risk, check_risk, wilson_interval
 from slipcar.planner.status import Status
 
 Array = np.ndarray
@@ -34,12 +32,14 @@ Array = np.ndarray
 #: What feedback is charged for the spread of g where nothing else is; as `Feedback`'s Qf.
 _SPREAD_WEIGHT = 100.0
 #: Paths that the search for a price looks at: so many violations are expected among them.
-_COUNTED = 1000
+_COUNTED, _COUNTED_ON_PATH = 1000, 400
 _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
 #: Common random numbers of the search, and those of each verification, which it never saw.
 _SEARCH_SEED, _VERIFICATION_SEED = 0x51EE, 0xF5E5
 #: Standard deviations of Monte Carlo that the search keeps below δ, and verifications at most.
 _CAUTION, _VERIFICATIONS = 1.5, 3
+#: How far below its target, relatively, a rate of the search may stay.
+_NEAR, _NEAR_ON_PATH = 0.15, 0.08
 #: With fewer violations expected among the paths, Boole's bound is searched with instead.
 _COUNTABLE = 10
 #: Boole's bound overestimates, as nodes are correlated, by less than this.
@@ -53,10 +53,15 @@ class Request:
     """What is asked for beyond the mean.
 
     Attributes:
-        risk: δ in (0, 1): the probability that a path violates `problem.constraint` at any node
-            must not exceed it. The constraint is priced and the price searched for by Monte Carlo
+        risk: δ in (0, 1): the probability that a path violates `problem.constraint` must not
+            exceed it. The constraint is priced and the price searched for by Monte Carlo
             on common random numbers; `Plan.risk` holds what was predicted and what fresh paths
             say. Where no price leads there: status RISK_UNREACHABLE, with the plan of least risk.
+        risk_at: what is promised: `"nodes"`, the paper's definition, at any node of the discretised
+            chain with steps of the plan's own integrator; or `"path"`, at any instant of the SDE,
+            controls held between nodes. Then the mean is integrated by `integrator="rk4"` unless
+            another is asked for, a row of a constraint keeps the distance that paths stray between
+            nodes, and paths are simulated in substeps with Brownian bridges between them.
         risk_price: ν ≥ 0: add ν Σ P(violation) over nodes and constraints to the expected cost
             (Boole's bound; optimal risk allocation). No Monte Carlo: milliseconds.
         risk_episodes: fresh paths that verify a risk, ≥ 100.
@@ -74,6 +79,7 @@ class Request:
     """
 
     risk: float | None = None
+    risk_at: str = "nodes"
     risk_price: float | None = None
     risk_episodes: int = 100_000
     feedback: bool = False
@@ -91,6 +97,9 @@ class Request:
             if isinstance(self.risk_price, (bool, np.bool_)):
                 raise ValueError(f"risk_price must be a number >= 0, not {self.risk_price!r}")
             check_number("risk_price", self.risk_price, zero_allowed=True)
+        check_choice("risk_at", self.risk_at, PROMISES)
+        if self.on_path and self.risk is None and self.risk_price is None:
+            raise ValueError("risk_at='path' says what a risk is about: give risk or risk_price")
         check_count("risk_episodes", self.risk_episodes, least=100)
         check_flag("feedback", self.feedback)
         check_flag("expected", self.expected)
@@ -101,6 +110,11 @@ class Request:
                     "terminal_weight is of expected costs: it needs feedback, expected, risk or "
                     "risk_price"
                 )
+
+    @property
+    def on_path(self) -> bool:
+        """Whether constraints are to hold between nodes."""
+        return self.risk_at == "path"
 
     @property
     def wanted(self) -> bool:
@@ -150,6 +164,7 @@ class Request:
             soft=given is not None,
             feedback=self.feedback,
             variance_weight=variance_weight,
+            bridged=self.on_path,
         )
 
 
@@ -180,7 +195,8 @@ def steer(
     stakes = request.stakes(model, options.variance_weight)
     field = Field(model, options, stakes, candidates)
     if request.risk is not None:
-        return _Calibration(float(request.risk), request.risk_episodes, model, field).run()
+        counting = Counting(model, field.guarded, at_path=request.on_path)
+        return _Calibration(float(request.risk), request.risk_episodes, counting, field).run()
     plan = field.solve(request.risk_price or 0.0) or field.attempt
     message = "" if plan.status.ok else "the iteration on the expected cost did not settle"
     return _steering(field, plan, plan.status, message)
@@ -193,56 +209,37 @@ def _steering(
     return Steering(plan, status, cost, risk, message, origin, field.steps)
 
 
-def law(model: Model, plan: Steered) -> Any:
-    """The law u = ū + K (x − μ) within bounds, as a function (t, x (..., n)) -> (..., m)."""
-    angles = tuple(getattr(model.problem, "angles", ()))
-    closed = bool(plan.gains.any())
-
-    def control(t: Any, x: Array) -> Array:
-        k = int(np.argmin(np.abs(model.times[:-1] - t)))
-        if not closed:
-            return np.broadcast_to(plan.u[k], (*np.shape(x)[:-1], plan.u.shape[1]))
-        return model.admissible(plan.u[k] + wrap(x - plan.x[k], angles) @ plan.gains[k].T)
-
-    return control
-
-
 class _Calibration:
     """The search for the price at which a risk δ is kept, the plan at that price, and the proof."""
 
-    def __init__(self, delta: float, episodes: int, model: Model, field: Field) -> None:
-        self._delta, self._episodes, self._model, self._field = delta, episodes, model, field
-        self._paths = int(np.clip(_COUNTED / delta, _LEAST_PATHS, _MOST_PATHS))
+    def __init__(self, delta: float, episodes: int, counting: Counting, field: Field) -> None:
+        self._delta, self._episodes, self._counting, self._field = delta, episodes, counting, field
+        counted = _COUNTED_ON_PATH if counting.at_path else _COUNTED
+        self._paths = int(np.clip(counted / delta, _LEAST_PATHS, _MOST_PATHS))
         self._countable = delta * self._paths >= _COUNTABLE
         noise = np.sqrt(delta * (1.0 - delta) * (1.0 / self._paths + 1.0 / episodes))
         cautious = max(delta - _CAUTION * float(noise), 0.3 * delta)
         self._target = cautious if self._countable else delta
-        self._simulated = 0.0
+        self._at_nodes = 0.0
         self._tried: list[PricedRate] = []
 
     def run(self) -> Steering:
         """Search."""
-        delta, target, field = self._delta, self._target, self._field
+        delta, field = self._delta, self._field
         free = field.solve(0.0)
         # Boole's bound says whether to look.
         if free is not None and field.predicted_risk(free) <= _BOOLE * delta:
             rate = self._measure(free)
             self._tried.append(PricedRate(0.0, field.predicted_risk(free), rate))
-            if rate <= target and (verified := self._verified(free, 0)) <= delta:
-                return self._answer(free, 0.0, verified, True)
+            if rate <= self._target:
+                self._refine(free)
+                if (verified := self._verified(free, 0)) <= delta:
+                    return self._answer(free, 0.0, verified, True)
         price = _FIRST * max(abs(field.attempt.effort), 1e-6) / delta
+        if (first := field.solve(price)) is not None:
+            self._refine(first)
         for attempt in range(_VERIFICATIONS):
-            search = search_price(
-                field.solve,
-                self._measure,
-                target=target,
-                start=price,
-                largest=_DEAREST * price,
-                resolution=1.0 / self._paths if self._countable else 0.0,
-            )
-            for trial in search.tried:
-                predicted = trial.answer and field.predicted_risk(trial.answer)
-                self._tried.append(PricedRate(trial.price, predicted, trial.rate))
+            search = self._searched(price)
             plan, price = search.best, search.price
             if plan is None:
                 last = field.attempt
@@ -252,23 +249,42 @@ class _Calibration:
             if verified <= delta or not search.reached:
                 break
             # Fresh paths disagree with those of the search: ask for less.
-            target *= 0.9 * delta / verified
+            self._target *= 0.9 * delta / verified
         return self._answer(plan, price, verified, search.reached and verified <= delta)
+
+    def _refine(self, plan: Steered) -> None:
+        self._counting.refine(plan, self._delta, self._episodes, _SEARCH_SEED)
+
+    def _searched(self, price: float) -> PriceSearch:
+        """The search from a price."""
+        search = search_price(
+            self._field.solve,
+            self._measure,
+            target=self._target,
+            start=price,
+            largest=_DEAREST * price,
+            tolerance=_NEAR_ON_PATH if self._counting.at_path else _NEAR,
+            resolution=1.0 / self._paths if self._countable else 0.0,
+        )
+        for trial in search.tried:
+            predicted = trial.answer and self._field.predicted_risk(trial.answer)
+            self._tried.append(PricedRate(trial.price, predicted, trial.rate))
+        return search
 
     def _measure(self, plan: Steered) -> float:
         """The rate on the paths of the search; predicted where they are too few to tell."""
         if self._countable:
-            return self._rate(plan, self._paths, _SEARCH_SEED)
+            return self._counting.search_rate(plan, self._paths, _SEARCH_SEED, self._target)
         return self._field.predicted_risk(plan)
 
     def _verified(self, plan: Steered, attempt: int) -> float:
-        return self._rate(plan, self._episodes, _VERIFICATION_SEED + attempt)
+        seed = _VERIFICATION_SEED + attempt
+        rate, self._at_nodes = self._counting.rates(plan, self._episodes, seed)
+        return rate
 
-    def _rate(self, plan: Steered, episodes: int, seed: int) -> float:
-        began, driven = time.perf_counter(), law(self._model, plan)
-        broken = violations(self._model.problem, driven, episodes=episodes, seed=seed)
-        self._simulated += time.perf_counter() - began
-        return float(broken.mean())
+    def _successes(self, rate: float) -> float:
+        """Violations behind a rate; on the path a sum of probabilities."""
+        return rate * self._episodes if self._counting.at_path else round(rate * self._episodes)
 
     def _answer(self, plan: Steered, price: float, verified: float, kept: bool) -> Steering:
         delta, episodes = self._delta, self._episodes
@@ -276,12 +292,15 @@ class _Calibration:
             requested=delta,
             predicted=self._field.predicted_risk(plan),
             verified=verified,
-            interval=wilson_interval(round(verified * episodes), episodes),
+            interval=wilson_interval(self._successes(verified), episodes),
             episodes=episodes,
             price=price,
             reached=kept,
             tried=tuple(self._tried),
-            simulation_time=self._simulated,
+            simulation_time=self._counting.seconds,
+            at="path" if self._counting.at_path else "nodes",
+            substeps=self._counting.substeps,
+            verified_at_nodes=self._at_nodes,
         )
         status, say = plan.status, ""
         if not kept:

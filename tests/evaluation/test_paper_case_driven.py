@@ -11,12 +11,14 @@ from slipcar.evaluation.rows import (
     FEEDBACK,
     FEEDBACK_RISK,
     OPEN_RISK,
+    PATH_CHANCE,
     PPO,
     RECEDING,
     RECEDING_MARGINS,
     REFERENCE,
     STEERED,
     STEERED_CHANCE,
+    STEERED_PATH_CHANCE,
     STOCHASTIC,
     STRAIGHT,
     default_rows,
@@ -127,3 +129,20 @@ def test_default_rows_speak_of_plans_that_failed(paper, replay, monkeypatch):
         assert any(note.startswith(f"{name}: the plan is MAX_ITERATIONS") for note in notes)
         assert solver_failures(rows[name]) == 1
     assert len(notes) == 4
+
+
+def test_finer_simulations_have_rows_promised_on_the_path(paper, replay, monkeypatch):
+    def quick(scenario, **options):
+        changed = {"risk": 0.05, "risk_episodes": 2048, "starts": 1} if "risk" in options else {}
+        return plan(scenario, **{**options, **changed})
+
+    monkeypatch.setattr("slipcar.evaluation.rows.plan", quick)
+    policy = replay(paper, (0.0, 0.0))
+    plain, fine = (default_rows(paper, policy=policy, substeps=n) for n in (1, 4))
+    assert set(fine[0]) - set(plain[0]) == {PATH_CHANCE, STEERED_PATH_CHANCE}
+    for name in (PATH_CHANCE, STEERED_PATH_CHANCE):
+        risk = fine[0][name].plan.risk
+        (note,) = (note for note in fine[1] if note.startswith(name + ":"))
+        assert "on the path" in str(risk)
+        assert str(risk) in note
+        assert f"at nodes of the same paths {risk.verified_at_nodes:.3%}" in note
