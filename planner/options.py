@@ -14,6 +14,7 @@ from slipcar.planner.records import Iteration
 
 #: What options may be, for type checkers and for the checks below.
 Method = Literal["auto", "newton", "convex"]
+RiskAt = Literal["nodes", "path"]
 Backend = Literal["structured", "osqp", "cvxpy"]
 TrustRegionName = Literal["adaptive", "paper", "none"]
 Linearization = Literal["composite", "literal"]

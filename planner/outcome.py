@@ -37,6 +37,7 @@ class Outcome:
     history: Sequence[Iteration]  #: empty where it was not kept
     objective: float  #: effort, penalty, running cost and w ∫ tr Σ dt
     message: str = ""
+    answered: bool = False  #: whether its adjoint is bounded by feedback alone, as of what explodes
 
     @classmethod
     def at(

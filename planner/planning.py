@@ -18,6 +18,7 @@ from slipcar.planner.options import (
     Linearization,
     Method,
     Options,
+    RiskAt,
     TrustRegionName,
     plain,
 )
@@ -64,7 +65,7 @@ def plan(
     time_weight: float = 1.0,
     final_time_bounds: tuple[float, float] | None = None,
     risk: float | None = None,
-    risk_at: str = "nodes",
+    risk_at: RiskAt = "nodes",
     risk_price: float | None = None,
     risk_episodes: int = 100_000,
     feedback: bool = False,

@@ -127,12 +127,14 @@ class Ending(NamedTuple):
         side: of the workspace, where the last iterate is.
         tried: steps.
         at: the last iterate's costs.
+        answered: whether the adjoint was taken along paths that the step's feedback leads to.
     """
 
     status: Status | None
     side: int
     tried: int
     at: Evaluation
+    answered: bool = False
 
 
 class Filler(Protocol):
@@ -208,7 +210,8 @@ class Iteration:
         status = self._iterate()
         if self.charged:
             self.at = self._evaluated(self.side)
-        return Ending(status, self.side, self.tried, self.at)
+        answered = bool(self._knobs[_ANSWERED] > 0.0)
+        return Ending(status, self.side, self.tried, self.at, answered)
 
     def _iterate(self) -> Status:
         task, tuning = self.task, self.tuning

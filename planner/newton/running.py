@@ -138,6 +138,7 @@ def _outcome(
         iterations=ending.tried,
         history=history,
         objective=objective,
+        answered=ending.answered,
     )
 
 

@@ -103,6 +103,8 @@ def attempt(task: Task, options: Options, *, history: bool = True) -> Outcome:
     ended: list[Outcome] = []
     for judged in (True,) if task.judged else (False, True):
         outcome = _newton(task, options.with_iterations(limit), judged=judged, history=history)
+        if outcome.answered:  # what explodes may have lost the digits that would prove it
+            outcome = _certified(task, options, outcome)
         if outcome.status in (Status.CONVERGED, Status.STOPPED):
             return _joined([*ended, outcome])
         ended.append(outcome)
