@@ -29,12 +29,14 @@ import risk_worlds
 import simulation
 import systems.section
 import turns
+import which_way
 import worlds
 
 PARTS = ("planners", "growth", "cold", "simulation", "environment", "risk_times")
 #: Minutes; on request.
 LONG_PARTS = (
-    "worlds", "systems", "risk_paper", "risk_path", "risk", "live_page", "control_loop", "c_law",
+    "worlds", "systems", "which_way", "risk_paper", "risk_path", "risk",
+    "live_page", "control_loop", "c_law",
 )  # fmt: skip
 #: Pages of the docs: file, heading and parts.
 PAGES = (
@@ -44,7 +46,7 @@ PAGES = (
         "Benchmarks: risk, feedback, receding horizon",
         ("risk_paper", "risk_path", "risk_times", "risk"),
     ),
-    ("benchmarks-systems.md", "Benchmarks: users' systems", ("systems",)),
+    ("benchmarks-systems.md", "Benchmarks: users' systems", ("systems", "which_way")),
     (
         "benchmarks-live.md",
         "Benchmarks: live page, control loop, C",
@@ -66,6 +68,7 @@ def main() -> None:
         "risk_times": functools.partial(risk_times.section, arguments.rounds),
         "worlds": functools.partial(worlds.section, arguments.seeds, folder),
         "systems": functools.partial(systems.section.section, folder),
+        "which_way": functools.partial(which_way.section, folder),
         "risk_paper": risk_paper.section,
         "live_page": live_page.section,
         "control_loop": control_loop.section,
