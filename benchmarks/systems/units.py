@@ -111,6 +111,8 @@ class InUnits:
         self.control_weight = per_time * problem.control_weight / np.outer(by.controls, by.controls)
         if hasattr(problem, "control_bounds"):
             self.control_bounds = by.controls * problem.control_bounds
+        if hasattr(problem, "control_radius"):  # of controls of one unit
+            self.control_radius = float(by.controls[0]) * problem.control_radius
         if hasattr(problem, "penalty"):
             self.penalty_weight = per_time * problem.penalty_weight / by.rows**2
             self.penalty = lambda t, x: by.rows * problem.penalty(*self._old(t, x))

@@ -95,13 +95,23 @@ def test_disturbed_guesses_converge(systems, name, seed):
 
 
 @pytest.mark.parametrize("units", ["mm", "km", "kN", "µs", "cost × 1e4"])
-@pytest.mark.parametrize("name", ["Rocket", "CartPole"])
+@pytest.mark.parametrize("name", ["Rocket", "CartPole", "Rendezvous in a ball", "Rocket, convex"])
 def test_units_change_neither_iterations_nor_plan(systems, name, units):
-    module, system = systems("units"), systems("catalogue").SYSTEMS[name]
+    kind, _, variant = name.replace(",", " ").partition(" ")
+    module, system = systems("units"), systems("catalogue").SYSTEMS[kind]
     chosen = {each.name: each for each in module.CHOICES}[units]
     factors = module.factors(system.dimensions, chosen)
-    p = plan(system.make(), variance_weight=0.0)
-    q = plan(module.in_units(system.make(), system.dimensions, chosen), variance_weight=0.0)
+    here, asked = system.make(), {"variance_weight": 0.0}
+    if "convex" in variant:
+        asked["method"] = "convex"
+    if "ball" in variant:  # which the free plan would leave
+        free = np.linalg.norm(plan(here, **asked).controls, axis=1)
+        here.control_radius = float(0.8 * free.max())
+    p = plan(here, **asked)
+    q = plan(module.in_units(here, system.dimensions, chosen), **asked)
+    assert p.status is Status.CONVERGED
+    if "ball" in variant:
+        assert np.isclose(np.linalg.norm(p.controls, axis=1).max(), here.control_radius)
     assert (q.status, q.iterations) == (p.status, p.iterations)
     for there, here, factor in (
         (q.mean, p.mean, factors.states),
