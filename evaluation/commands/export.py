@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from slipcar.evaluation.commands.inputs import OwnScenarioOption, console, read_scenario
+from slipcar.evaluation.commands.inputs import OwnScenarioOption, read_scenario
+from slipcar.evaluation.commands.output import Output, OutputOption
 
 _PLANS, _POLICIES = ("c", "json"), ("onnx", "torchscript")
 
@@ -23,6 +24,7 @@ def export(
     float32: bool = False,
     unbounded: bool = False,
     scenario: OwnScenarioOption = None,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Write a plan's control law as C or JSON, or a policy as ONNX or TorchScript.
 
@@ -50,6 +52,7 @@ def export(
         float32: single precision instead of double.
         unbounded: allow a plan of a problem whose controls have no bounds.
         scenario: of a policy: the world whose numbers are written.
+        output: what is printed.
     """
     stored = Path(source).suffix == ".npz"
     if stored != (to in _PLANS):
@@ -60,38 +63,47 @@ def export(
     if stored:
         if scenario is not None:
             raise ValueError("--scenario is of policies; a plan knows its own")
-        return _export_plan(Path(source), to, out, law, float32, unbounded)
+        return _export_plan(output, Path(source), to, out, law, float32, unbounded)
     if law != "planned" or unbounded:
         raise ValueError("--law and --unbounded are of plans, not of policies")
-    return _export_policy(source, to, out, scenario, float32)
+    return _export_policy(output, source, to, out, scenario, float32)
 
 
 def _export_plan(
-    source: Path, to: str, out: Path | None, kind: str, float32: bool, unbounded: bool
+    output: Output,
+    source: Path,
+    to: str,
+    out: Path | None,
+    kind: str,
+    float32: bool,
+    unbounded: bool,
 ) -> int:
     from slipcar.planner import Plan
     from slipcar.planner.c_code import write_c
     from slipcar.planner.law import Law
 
     law = Law.of(Plan.load(source), kind, unbounded=unbounded)
-    said = console()
+    said = output.console()
     if to == "json":
         if float32:
             raise ValueError("--float32 is of C, ONNX and TorchScript; JSON has the numbers whole")
         path = source.with_suffix(".json") if out is None else out
         path.write_text(json.dumps(law.as_dict()) + "\n", encoding="ascii")
+        output.data({"files": [str(path)]})
         said.print(f"law in {path}", markup=False, soft_wrap=True)
         return 0
     name = re.sub(r"\W+", "_", source.stem, flags=re.ASCII).lower().strip("_")
     name = name if name[:1].isalpha() else f"law_{name}".rstrip("_")
-    for path in write_c(law, source.parent if out is None else out, name, float32=float32):
+    written = write_c(law, source.parent if out is None else out, name, float32=float32)
+    output.data({"files": [str(path) for path in written]})
+    for path in written:
         said.print(f"written: {path}", markup=False, soft_wrap=True)
     said.print(f"test it: cc {name}.c {name}_test.c -o {name}_test && ./{name}_test", markup=False)
     return 0
 
 
 def _export_policy(
-    source: str, to: str, out: Path | None, scenario: str | None, float32: bool
+    output: Output, source: str, to: str, out: Path | None, scenario: str | None, float32: bool
 ) -> int:
     from slipcar.baselines import load_policy
 
@@ -103,7 +115,8 @@ def _export_policy(
         raise ImportError(f'{to} needs torch: pip install "slipcar[export]"') from error
     path = Path(Path(source).stem + TARGETS[to]) if out is None else out
     off = export_policy(policy, path, to, world, float32=float32)
-    said = console()
+    output.data({"files": [str(path)], "largest_difference": off})
+    said = output.console()
     said.print(f"policy in {path}", markup=False, soft_wrap=True)
     what = "not compared: onnxruntime is not installed"
     if off is not None:

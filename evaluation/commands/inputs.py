@@ -12,7 +12,6 @@ import tyro
 from slipcar.envs.families import Family
 from slipcar.envs.scenario import Scenario
 from slipcar.envs.validate import read_text
-from slipcar.evaluation.commands.output import console as console
 from slipcar.evaluation.makers import Maker
 
 if TYPE_CHECKING:

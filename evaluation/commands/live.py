@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from slipcar.evaluation.commands.inputs import ScenarioOption, console, read_scenario
+from slipcar.evaluation.commands.inputs import ScenarioOption, read_scenario
+from slipcar.evaluation.commands.output import Output, OutputOption
 
 
 def live(
@@ -20,6 +21,7 @@ def live(
     host: str = "127.0.0.1",
     port: int = 8123,
     open: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    output: OutputOption = Output(),  # noqa: B008  frozen
 ) -> int:
     """Serve a page on which obstacles, start and goal are dragged and the plan follows.
 
@@ -41,6 +43,7 @@ def live(
         host: address to serve on; other than the loopback, everyone who reaches it may plan.
         port: to serve on; 0 takes one that is free.
         open: show it in the browser.
+        output: what is printed.
     """
     if importlib.util.find_spec("aiohttp") is None:
         raise ImportError('the live page needs aiohttp: pip install "slipcar[live]"')
@@ -56,9 +59,10 @@ def live(
         systems[text.rpartition(":")[2]] = found() if isinstance(found, type) else found
     local = host in server.LOOPBACK
     app = server.application(world, systems, loopback=local)
-    said = console()
+    said = output.console()
 
     def ready(address: str) -> None:
+        output.data({"address": address})
         said.print(f"{address}  (Ctrl-C ends it)", markup=False, soft_wrap=True)
         if not local:
             said.print(f"everyone who reaches {host} may plan on this machine", style="bold red")

@@ -165,7 +165,7 @@ def _shared(
         squeezed = [j for j in block if widths[j] < high[j]]
         if not squeezed:
             break
-        widths[max(squeezed, key=lambda j: high[j] / widths[j])] += 1
+        widths[max(squeezed, key=lambda j: high[j] / max(widths[j], 1))] += 1
         spare -= 1
     return widths
 

@@ -89,7 +89,10 @@ def test_json_is_all_there_is_on_the_standard_output(capsys):
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_compare_prints_the_main_table_three_sentences_and_where_the_rest_is(tmp_path, capsys):
+def test_compare_prints_the_main_table_three_sentences_and_where_the_rest_is(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "120")  # room for the table in one piece
     options = ["compare", "--episodes", "200", "--no-figures", "--folder", str(tmp_path)]
     assert main(options) == 0
     said = " ".join(capsys.readouterr().out.split())

@@ -28,7 +28,7 @@ NOT_CHOICES = ("", "Newton", 3, None, b"euler", ("euler",))
 REFUSED = {
     "variance_weight": NOT_NUMBERS[1:], "tolerance": (0.0, *NOT_NUMBERS),
     "terminal_tolerance": NOT_NUMBERS, "max_iterations": NOT_COUNTS, "starts": NOT_COUNTS,
-    "method": NOT_CHOICES, "integrator": NOT_CHOICES, "linearization": NOT_CHOICES,
+    "method": NOT_CHOICES, "integrator": [value for value in NOT_CHOICES if value is not None], "linearization": NOT_CHOICES,
     "trust_region": [v for v in NOT_CHOICES if v is not None], "cold_start": NOT_CHOICES,
     "compiled": NOT_FLAGS, "free_first": NOT_FLAGS, "feedback": NOT_FLAGS, "expected": NOT_FLAGS,
     "risk": (0.0, 1.0, *NOT_NUMBERS[1:]), "risk_price": (True, *NOT_NUMBERS[1:]),
