@@ -36,6 +36,7 @@ from slipcar.evaluation.frontier_record import (
 from slipcar.evaluation.report import frontier as report_frontier
 from slipcar.evaluation.rollout import checked_counts
 from slipcar.planner import Feedback, OpenLoop, RecedingHorizon, plan
+from slipcar.planner.options import RiskAt
 
 __all__ = [
     "CURVES",
@@ -181,10 +182,10 @@ def candidates(
         (OPEN_LOOP, OpenLoop, False),
         (FEEDBACK, Feedback, True),
     )
+    promised: RiskAt = "path" if at_path else "nodes"
     for method, play, feedback in kinds:
         for price in prices:
             name = point_name(method, price)
-            promised = "path" if at_path else "nodes"
             found = plan(scenario, risk_price=price, risk_at=promised, feedback=feedback)
             if found.status.ok:
                 points.append(Point(name, method, price, play(found)))

@@ -23,13 +23,14 @@ TAKEN = (
 NOT_NUMBERS = (None, "much", float("nan"), float("inf"), -1.0, [1.0, 2.0], {}, 1j, object())
 NOT_COUNTS = (0, -3, 2.5, "two", True, [1], float("nan"))
 NOT_FLAGS = ("yes", 2, [], float("nan"), np.ones(2))
-NOT_CHOICES = ("", "Newton", 3, None, b"euler", ("euler",))
+NO_WORDS = ("", "Newton", 3, b"euler", ("euler",))
+NOT_CHOICES = (None, *NO_WORDS)
 #: Option -> values that are refused, and what is asked for with it.
 REFUSED = {
     "variance_weight": NOT_NUMBERS[1:], "tolerance": (0.0, *NOT_NUMBERS),
     "terminal_tolerance": NOT_NUMBERS, "max_iterations": NOT_COUNTS, "starts": NOT_COUNTS,
-    "method": NOT_CHOICES, "integrator": [value for value in NOT_CHOICES if value is not None], "linearization": NOT_CHOICES,
-    "trust_region": [v for v in NOT_CHOICES if v is not None], "cold_start": NOT_CHOICES,
+    "method": NOT_CHOICES, "integrator": NO_WORDS, "linearization": NOT_CHOICES,
+    "trust_region": NO_WORDS, "cold_start": NOT_CHOICES,
     "compiled": NOT_FLAGS, "free_first": NOT_FLAGS, "feedback": NOT_FLAGS, "expected": NOT_FLAGS,
     "risk": (0.0, 1.0, *NOT_NUMBERS[1:]), "risk_price": (True, *NOT_NUMBERS[1:]),
     "callback": (3, "print", []), "solver": ("gurobi", 3, None),
