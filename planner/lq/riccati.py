@@ -71,13 +71,14 @@ def stage(
     return T[m:, m:], T[:m, m:], bad
 
 
-def terminal_multiplier(V: Array, g: Array, softness: Any) -> tuple[Array, Any]:
+def terminal_multiplier(V: Array, g: Array, softness: Any, rounding: Array) -> tuple[Array, Any]:
     """ν of the terminal condition from V at the beginning, by Cholesky; bad pivots counted.
 
     Args:
         V: of node 0, where d = 0.
         g: (t,).
         softness: this part of W's diagonal is added to it.
+        rounding: (t,): a condition that no control moves is met if it lacks no more.
     """
     t = len(g)
     n = len(V) - 1 - t
@@ -91,7 +92,7 @@ def terminal_multiplier(V: Array, g: Array, softness: Any) -> tuple[Array, Any]:
         rest = s[i] - sum(L[i, j] * y[j] for j in range(i))
         pivot = W[i, i] - L[i, :i].dot(L[i, :i]) + softness * W[i, i]
         # What cannot be moved need not be, if it is where it must be.
-        pivot = choose(pivot, pivot, choose(magnitude(rest), pivot, 1.0))
+        pivot = choose(pivot, pivot, choose(magnitude(rest) - rounding[i], pivot, 1.0))
         bad = bad + choose(pivot, 0.0, 1.0)
         L[i, i] = np.sqrt(pivot)
         y.append(rest / L[i, i])

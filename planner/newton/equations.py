@@ -49,7 +49,7 @@ Rows = Any  # SymbolRows or NumberRows
 
 
 #: So much of the terms of a sum is rounding.
-_LAST_DIGITS = 4e-16
+_LAST_DIGITS = 1e-14
 #: What the iteration tells its kernels, entries of the row `knob`:
 KNOBS = (
     "alpha",  # length of the step that `shift` takes
@@ -285,11 +285,7 @@ class Equations:
         p = self.problem.at(rows)
         effort, running, charged, pull, gap, defect, penalty = carried["sums"]
         self._switch(rows, p.c)
-        # Less than the rounding of what g is put together from is nothing: a condition that no
-        # control moves is then met.
-        rounding = _LAST_DIGITS * magnitude(p.G).dot(magnitude(rows["x"]))
-        g = choose(rounding - magnitude(p.g), 0.0 * p.g, p.g)
-        for name, value in (("c", p.c), ("C", p.C), ("g", g), ("G", p.G)):
+        for name, value in (("c", p.c), ("C", p.C), ("g", p.g), ("G", p.G)):
             rows.write(name, value)
         if p.state_cost:
             rows.write("H_xx", p.H_xx)
@@ -297,11 +293,11 @@ class Equations:
         charged = charged + row_cost
         miss, residual = 0.0, 0.0
         if self.form.soft:
-            charged = charged + (rows["W"] * g).dot(g)
+            charged = charged + (rows["W"] * p.g).dot(p.g)
         else:
-            pull = pull + rows["nu"].dot(g)
-            miss = magnitude(rows["nu"]).dot(magnitude(g))
-            residual = riccati.largest(g, 0.0)
+            pull = pull + rows["nu"].dot(p.g)
+            miss = magnitude(rows["nu"]).dot(magnitude(p.g))
+            residual = riccati.largest(p.g, 0.0)
         evaluation = Evaluation(
             effort=effort, running=running + rows["dn"] * p.H, charged=charged, pull=pull, gap=gap,
             miss=miss, defect=defect, residual=residual, penalty=penalty + mean_cost,
@@ -391,6 +387,7 @@ class Equations:
         return {
             "V": Symmetric(riccati.last_value(Q, q, G)), "bad": 0.0, "charged": charged,
             "reach": np.zeros(len(G)),
+            "rounding": _LAST_DIGITS * magnitude(G).dot(magnitude(rows["x"])),
         }  # fmt: skip
 
     def _backward(self, rows: Rows, carried: Carried) -> Carried:
@@ -414,6 +411,7 @@ class Equations:
         reach = choose(rows["late"], self._reached(V), carried["reach"])
         return {
             "V": Symmetric(V), "bad": carried["bad"] + bad, "charged": charged, "reach": reach,
+            "rounding": carried["rounding"],
         }  # fmt: skip
 
     def _reached(self, V: Array) -> Array:
@@ -432,7 +430,7 @@ class Equations:
         bad, dearest = carried["bad"], 0.0
         if not self.form.soft:
             V, softness = carried["V"], self._knob(rows, "softness")
-            nu, singular = riccati.terminal_multiplier(V, rows["g"], softness)
+            nu, singular = riccati.terminal_multiplier(V, rows["g"], softness, carried["rounding"])
             reach = choose(self._knob(rows, "kappa"), rows["reach"], carried["reach"])
             rows.write("reach", reach)
             bad, dearest = bad + singular, (nu * nu).dot(self._reached(V))

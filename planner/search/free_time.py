@@ -37,7 +37,7 @@ _FIRST_RADIUS, _LARGEST_RADIUS, _SHRINK, _GROW = 0.2, 0.5, 0.25, 2.0
 #: Stop when a step is this short relative to T, or the transversality residual this small
 #: relative to the mean cost per time; give up after so many plans, or where none was found in so
 #: many times the iterations that one may take.
-_SHORTEST, _TRANSVERSALITY, _PLANS, _IN_VAIN = 1e-9, 1e-9, 40, 2
+_SHORTEST, _TRANSVERSALITY, _PLANS, _IN_VAIN = 1e-9, 1e-9, 40, 1.5
 #: Tolerance of the plans (the slope is only as good as the plan it is taken at), by Newton's
 #: method and by the convex scheme, which converges linearly.
 _PRECISE, _PRECISE_CONVEX = 1e-16, 1e-12
@@ -134,14 +134,18 @@ class _Search:
 
     def planned(self, nominal: Outcome) -> _Point:
         """The first horizon that can be planned for; too short a one is the usual reason not to."""
-        T = float(np.clip(self.model.times[-1] - self.model.times[0], *self.bounds))
+        own = self.model.times[-1] - self.model.times[0]
+        T, most = float(np.clip(own, *self.bounds)), self.options.max_iterations
+        left = int(_IN_VAIN * most)
+        if not nominal.status.ok and own == T:
+            T, left = min(_LONGER * T, self.bounds[1]), left - nominal.iterations
         self.radius = _FIRST_RADIUS * T
         while True:
-            point = self._at(T, nominal.x, nominal.u)
+            point = self._at(T, nominal.x, nominal.u, max(1, min(left, most)))
             self._add(point, True)
             ended = point.outcome.status.ok or point.outcome.status is Status.STOPPED
-            spent = sum(step.iterations for step in self.steps)
-            if ended or self.bounds[1] <= T or spent >= _IN_VAIN * self.options.max_iterations:
+            left -= point.outcome.iterations
+            if ended or self.bounds[1] <= T or left <= 0:
                 return point
             T = min(_LONGER * T, self.bounds[1])
 
@@ -174,12 +178,15 @@ class _Search:
                 best = new
         return best, False
 
-    def _at(self, T: float, x: Array, u: Array) -> _Point:
+    def _at(self, T: float, x: Array, u: Array, iterations: int | None = None) -> _Point:
         """The plan at a horizon of T seconds, a dilation of the time grid."""
+        most = self.options.max_iterations if iterations is None else iterations
         weight, begin = self.options.variance_weight, self.model.times[0]
         times = begin + (self.model.times - begin) * (T / (self.model.times[-1] - begin))
         model = dataclasses.replace(self.model, times=times, dt=np.diff(times))
-        outcome = attempt(Task(model, self.posed, x, model.admissible(u)), self.options)
+        outcome = attempt(
+            Task(model, self.posed, x, model.admissible(u)), self.options.with_iterations(most)
+        )
         if not outcome.status.ok:
             return _Point(model, outcome, T, np.inf, np.nan)
         at = first_order(model, outcome.x, outcome.u, weight)
