@@ -16,6 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from slipcar.planner.convex.units import natural_units
 from slipcar.planner.newton.posing import Posed
 from slipcar.planner.options import Options
 from slipcar.planner.outcome import Outcome
@@ -101,16 +102,16 @@ def _others(model: Model, x: Array, u: Array, count: int) -> Iterator[tuple[str,
     if offered is not None:
         yield from offered(count)
         return
-    for number, path in enumerate(itertools.islice(_bumps(model, x), 5 * count), start=1):
+    for number, path in enumerate(itertools.islice(_bumps(model, x, u), 5 * count), start=1):
         if _finite_along(model, path, u):
             yield f"bump {number}", path, u
 
 
-def _bumps(model: Model, x: Array) -> Iterator[Array]:
+def _bumps(model: Model, x: Array, u: Array) -> Iterator[Array]:
     """Endless smooth perturbations of a path (N, n), of its own size, ends kept; each both ways."""
     rng = np.random.default_rng(0)
     spread = np.ptp(x, axis=0)
-    size = np.where(spread > 0.0, spread, np.maximum(np.max(np.abs(x), axis=0), 1.0))
+    size = np.where(spread > 0.0, spread, natural_units(model, x, u, box=False).state)
     s = (model.times - model.times[0]) / (model.times[-1] - model.times[0])
     waves = np.sin(np.pi * np.outer(s, [1.0, 2.0]))
     while True:

@@ -29,6 +29,8 @@ _DIMENSIONAL = {
     "variance_weight", "terminal_weight", "time_weight", "risk_price", "free_final_time",
     "tolerance",
 }  # fmt: skip
+#: Growth of a disturbance on the way, relative to how far states move.
+_ROUNDING_SEEN = 1e8
 #: States beyond this lead to actions beyond float32.
 LARGEST = 1e30
 _BALLS = ("ball", "ball and box")
@@ -154,7 +156,7 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     """The same problem where all is of order one ends alike, and costs the same.
 
     How an iteration fails that leads nowhere (STALLED, MAX_ITERATIONS, INFEASIBLE) may turn on
-    rounding.
+    rounding; and which way a path goes that blows it up.
     """
     if recipe.plain == recipe:
         return []
@@ -165,9 +167,21 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     q, C = other.value, Own(recipe).C
     if p.status.ok is not q.status.ok:
         return [f"{p.status.name}, but {q.status.name} where all is of order one"]
+    if _explosive(p) or _explosive(q):
+        return []
     if p.status.ok and not abs(p.cost / C - q.cost) <= 1e-3 * (abs(q.cost) + q.effort) + 1e-9:
         return [f"cost {p.cost / C:.6g}, but {q.cost:.6g} where all is of order one"]
     return []
+
+
+def _explosive(p: Plan) -> bool:
+    """Whether rounding of the start is seen at the end: Euler's steps of a stiff system."""
+    sizes = np.ptp(p.mean, axis=0) + 1e-300
+    Phi = np.eye(len(sizes))
+    with np.errstate(all="ignore"):
+        for A in p.A:
+            Phi = A @ Phi
+        return not np.abs(Phi * sizes / sizes[:, None]).max() < _ROUNDING_SEEN
 
 
 # --------------------------------------------------------------------------- the rest
