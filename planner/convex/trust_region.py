@@ -108,7 +108,7 @@ class AdaptiveTrustRegion(TrustRegion):
 
     def __init__(self, free: int = 25, patience: int = 30, multiplier: float = 0.0) -> None:
         self.multiplier, self.bold = multiplier, free > _WITHIN_BOUNDS
-        self.free, self._patience, self._was_free = free, patience, free > 0
+        self._free, self._patience, self._was_free = free, patience, free > 0
         self._rejected = 0
 
     def cautious(self, multiplier: float) -> AdaptiveTrustRegion | None:
@@ -117,9 +117,9 @@ class AdaptiveTrustRegion(TrustRegion):
 
     def judge(self, step: Step) -> bool:
         """Accept or reject, and adapt the multiplier."""
-        self.free -= 1
-        self.bold = self.free > _WITHIN_BOUNDS
-        if self.free >= 0 and step.actual > -math.inf:
+        self._free -= 1
+        self.bold = self._free > _WITHIN_BOUNDS
+        if self._free >= 0 and step.actual > -math.inf:
             return True
         # The multiplier that makes the penalty as large as what the step promised.
         natural = step.predicted / max(step.radius, 1e-300)

@@ -57,8 +57,7 @@ class Task:
     u: Array  #: guess, (K, m)
     free_first: bool = False  #: whether to leave penalties out at first
     label: str = ""  #: for people
-    judged: bool = False  #: whether Newton's method judges its first steps, too
-    bold_steps: int | None = None  #: steps that the convex scheme takes whole; None is its default
+    judged: bool = False  #: whether steps are judged from the first
 
 
 def completed(problem: Problem, options: Options) -> Model:
@@ -114,7 +113,7 @@ def attempt(task: Task, options: Options, *, history: bool = True) -> Outcome:
             break
     best = _best(task.model, options, ended)
     if left > 0 and not _feasible(task.model, options, best):
-        second = dataclasses.replace(task, x=best.x, u=best.u, free_first=False, bold_steps=0)
+        second = dataclasses.replace(task, x=best.x, u=best.u, free_first=False, judged=True)
         ended.append(_convex(second, options.with_iterations(left)))
         if ended[-1].status in (Status.CONVERGED, Status.STOPPED, Status.INFEASIBLE):
             return _joined(ended)
@@ -209,7 +208,7 @@ def _convex_once(task: Task, options: Options) -> Outcome:
             return dataclasses.replace(free, penalty=penalty, objective=free.objective + penalty)
         x, u, before = free.x, free.u, tuple(free.history)
         options = options.with_iterations(max(1, options.max_iterations - len(before)))
-    outcome = _iterate(model, options, x, u, task.bold_steps)
+    outcome = _iterate(model, options, x, u, judged=task.judged)
     history = (*before, *outcome.history)
     return dataclasses.replace(outcome, iterations=len(history), history=history)
 
@@ -232,12 +231,12 @@ def _without_penalties(model: Model, options: Options, x: Array, u: Array) -> Ou
 
 
 def _iterate(
-    model: Model, options: Options, x: Array, u: Array, bold_steps: int | None = None
+    model: Model, options: Options, x: Array, u: Array, *, judged: bool = False
 ) -> Outcome:
     solver = make_solver(options.solver) if isinstance(options.solver, str) else options.solver
     trust = TRUST_REGIONS[options.trust_region or "adaptive"]()
-    if isinstance(trust, AdaptiveTrustRegion) and bold_steps is not None:
-        trust = AdaptiveTrustRegion(min(bold_steps, trust.free))
+    if judged and isinstance(trust, AdaptiveTrustRegion):
+        trust = AdaptiveTrustRegion(free=0)
     return iteration.iterate(model, solver, trust, options, x, u)
 
 
