@@ -18,9 +18,6 @@ from pathlib import Path
 
 import numpy as np
 from report import Section
-from systems.judge import judge
-from systems.memory import solved
-from systems.transcription import Guess, Programme
 
 from slipcar.envs import Scenario, routes
 from slipcar.planner import plan
@@ -73,7 +70,7 @@ class Row:
         )
 
 
-def random_guess(scenario: Scenario, seed: int) -> Guess:
+def random_guess(scenario: Scenario, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """A smooth random path past the straight line, driven in one of the gears."""
     rng = np.random.default_rng(seed)
     s = scenario.times / scenario.horizon
@@ -90,6 +87,10 @@ def random_guess(scenario: Scenario, seed: int) -> Guess:
 
 def best_of_peer(scenario: Scenario, folder: Path, count: int) -> float:
     """The least cost that IPOPT finds from `count` guesses."""
+    from systems.judge import judge  # needs CasADi
+    from systems.memory import solved
+    from systems.transcription import Programme
+
     programme = Programme(scenario, tolerance=1e-8)
     costs = [math.inf]
     for seed in range(count):

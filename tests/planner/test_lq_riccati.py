@@ -132,7 +132,7 @@ def _by_recursion(p):
         V.insert(0, value)
         laws.insert(0, law)
         wrong += bad
-    nu, bad = riccati.terminal_multiplier(V[0], p.g, _softness(p))
+    nu, bad = riccati.terminal_multiplier(V[0], p.g, _softness(p), 0.0 * p.g)
     d, path, controls, adjoint = np.zeros(n), [], [], []
     for k in range(K):
         controls.append(riccati.respond(laws[k], d, nu))
@@ -166,7 +166,9 @@ def _code(n, m, t, known=()):
         return {"V": Symmetric(V), "bad": carried["bad"] + bad}
 
     def first(rows, carried):
-        nu, bad = riccati.terminal_multiplier(carried["V"], rows["g"], rows["softness"])
+        nu, bad = riccati.terminal_multiplier(
+            carried["V"], rows["g"], rows["softness"], 0.0 * rows["g"]
+        )
         rows.write("nu", nu)
         rows.write("bad", carried["bad"] + bad)
 
@@ -374,6 +376,15 @@ def test_an_end_that_nothing_moves_is_refused(solve):
     p = _random(6, 6, 4, 2, 3, 0.2)
     p.B[:] = 0.0
     assert solve(p) is None
+
+
+@pytest.mark.parametrize(("missed", "met"), [(0.0, True), (0.9e-9, True), (1.1e-9, False)])
+def test_an_end_that_nothing_moves_is_met_up_to_rounding(missed, met):
+    V, rounding = np.zeros((3, 3)), np.array([1e-9])
+    nu, bad = riccati.terminal_multiplier(V, np.array([missed]), 1e-9, rounding)
+    assert (bad == 0.0) == met
+    if met:
+        assert abs(nu[0]) <= rounding[0]  # nothing to be paid
 
 
 @solvers
