@@ -173,6 +173,9 @@ class ExpectedCost:
     #: Σ Φ(h/s) over nodes and constraints, at most 1: Boole's bound of the probability of any
     #: violation
     risk: float
+    #: part of all K m controls that the feedback asks for beyond their bounds, where they are
+    #: clipped, which the moments do not know of
+    clipped: float = 0.0
 
     @property
     def total(self) -> float:

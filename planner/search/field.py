@@ -48,7 +48,16 @@ def expected_cost(model: Model, stakes: Stakes, plan: Steered, risk: float = 0.0
         penalty=float(penalties.sum()),
         goal=float(np.dot(stakes.terminal, plan.g**2 + spread)),
         risk=risk,
+        clipped=clipped(model, plan),
     )
+
+
+def clipped(model: Model, plan: Steered) -> float:
+    """Part of the K m controls that u + K (x − μ), Gaussian, asks for beyond their bounds."""
+    variance = np.einsum("kij,kjl,kil->ki", plan.gains, plan.covariance[:-1], plan.gains)
+    s = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+    beyond = normal_cdf((model.lower - plan.u) / s) + normal_cdf((plan.u - model.upper) / s)
+    return float(np.mean(beyond * (variance > 0.0)))
 
 
 def charged(model: Model, stakes: Stakes, plan: Steered) -> float:

@@ -31,6 +31,8 @@ Array = np.ndarray
 
 #: What feedback is charged for the spread of g where nothing else is; as `Feedback`'s Qf.
 _SPREAD_WEIGHT = 100.0
+#: More of the controls clipped than this is said.
+_CLIPPED = 0.01
 #: Paths that the search for a price looks at: so many violations are expected among them.
 _COUNTED, _COUNTED_ON_PATH = 1000, 400
 _LEAST_PATHS, _MOST_PATHS = 10_000, 100_000
@@ -206,6 +208,12 @@ def _steering(
     field: Field, plan: Steered, status: Status, message: str, risk: Risk | None = None
 ) -> Steering:
     cost, origin = field.cost(plan), field.origin(plan)
+    if status.ok and cost.clipped > _CLIPPED:
+        say = (
+            f"the feedback asks for {100.0 * cost.clipped:.2g} % of its controls beyond their "
+            "bounds, where they are clipped: the cost is more than is expected"
+        )
+        message = f"{message}; {say}" if message else say
     return Steering(plan, status, cost, risk, message, origin, field.steps)
 
 

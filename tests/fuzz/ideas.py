@@ -156,7 +156,8 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     """The same problem where all is of order one ends alike, and costs the same.
 
     How an iteration fails that leads nowhere (STALLED, MAX_ITERATIONS, INFEASIBLE) may turn on
-    rounding; and which way a path goes that blows it up.
+    rounding; and which way a path goes that blows it up; and whether the only controls are found
+    that meet the end, all of them on their bounds.
     """
     if recipe.plain == recipe:
         return []
@@ -165,6 +166,8 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     if other.error is not None:
         return [f"refused where all is of order one: {other.error}"]
     q, C = other.value, Own(recipe).C
+    if p.status.ok is not q.status.ok and plain.cornered:
+        return []
     if p.status.ok is not q.status.ok:
         return [f"{p.status.name}, but {q.status.name} where all is of order one"]
     if _explosive(p) or _explosive(q):

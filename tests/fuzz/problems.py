@@ -129,6 +129,17 @@ class Own:
     def __repr__(self) -> str:
         return f"Own({self.recipe!r})"
 
+    @property
+    def cornered(self) -> bool:
+        """Whether the known controls are all on their bounds: the end is a corner of what is
+        reachable, where multipliers are not bounded and none need exist."""
+        bounds = getattr(self, "control_bounds", None)
+        return (
+            self.known is not None
+            and bounds is not None
+            and bool(np.isin(self.known, bounds).all())
+        )
+
     def _rolled(self, x: Array, t: Array, u: Array) -> Array:
         path = [x]
         with np.errstate(all="ignore"):

@@ -198,3 +198,36 @@ def test_random_worlds_converge_and_their_costs_are_met(seed):
     found = judged(Feedback(p), world, episodes=5_000)
     assert p.expected.total == pytest.approx(found.total, rel=0.15)
     assert found.total < judged(OpenLoop(p), world, episodes=5_000).total
+
+
+class Noisy:
+    """dx = (Ax + Bu) dt + σ dW, a mass in two axes that is pushed hard for its bounds."""
+
+    start, times = np.array([1.0, -0.5, 0.0, 0.3]), np.linspace(0.0, 2.0, 21)
+    control_weight, control_bounds = np.eye(2), np.array([1.6, 1.0])
+    terminal_weight = np.full(4, 20.0)
+
+    def drift(self, t, x, u):
+        return np.concatenate([x[..., 2:], u], axis=-1)
+
+    def diffusion(self, t, x):
+        return np.broadcast_to(0.25 * np.eye(4)[:, 2:], (*x.shape[:-1], 4, 2))
+
+    def terminal(self, x):
+        return x
+
+
+def test_the_clipped_part_of_the_controls_is_that_of_simulated_paths():
+    p = plan(Noisy(), feedback=True)
+    assert p.status is Status.CONVERGED
+    rng, paths = np.random.default_rng(5), 50_000
+    x, beyond = np.tile(p.mean[0], (paths, 1)), []
+    for k, dt in enumerate(np.diff(p.times)):
+        u = p.controls[k] + (x - p.mean[k]) @ p.gains[k].T  # not clipped: exactly Gaussian
+        beyond.append((np.abs(u) > Noisy.control_bounds).mean())
+        noise = rng.normal(size=(paths, 2)) * np.sqrt(dt)
+        x = x + dt * np.hstack([x[:, 2:], u]) + 0.25 * noise @ np.eye(4)[2:]
+    assert p.expected.clipped == pytest.approx(np.mean(beyond), abs=2e-3)
+    assert p.expected.clipped > 0.01
+    assert "beyond their bounds" in p.message
+    assert plan(Noisy(), expected=True).expected.clipped == 0.0  # no feedback, nothing to clip
