@@ -110,7 +110,7 @@ types: $(INSTALLED)  ## mypy over the installed package; mypy and pyright over a
 	$(BIN)/basedpyright
 
 # The arrays are small, a second BLAS thread brings nothing; and times then mean one core.
-compare suites frontier reproduce kills matrix fuzz train bench bench-worlds bench-docs docs docs-serve: export OMP_NUM_THREADS ?= 1
+compare suites frontier reproduce kills matrix test test-long fuzz train bench bench-worlds bench-docs docs docs-serve: export OMP_NUM_THREADS ?= 1
 
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

@@ -164,7 +164,7 @@ def natural_units(model: Model, x: Array, u: Array, *, box: bool) -> Units:
     if model.radius < np.inf:
         rates = np.full(len(rates), rates.max())
     size = max(float(np.abs(each / rates).max()) for each in (u, push))
-    if size == 0.0:
+    if size <= TINY**0.5:
         limits = np.minimum(np.minimum(model.upper, -model.lower), model.radius) / rates
         size = min((each for each in limits if 0.0 < each < np.inf), default=1.0)
     control = size * rates

@@ -26,7 +26,13 @@ import numpy as np
 from slipcar.planner.convex.subproblem import Subproblem, convexify, variance_of
 from slipcar.planner.moments import covariance as moments
 from slipcar.planner.moments.propagation import gain, weight_step
-from slipcar.planner.problem.feasibility import LEAST_MOVE, TINY, end_sizes, states_moved
+from slipcar.planner.problem.feasibility import (
+    LEAST_MOVE,
+    LEAST_PART,
+    TINY,
+    end_sizes,
+    states_moved,
+)
 from slipcar.planner.problem.linearization import Linearization, linearize
 from slipcar.planner.problem.model import Model, model_of
 
@@ -186,7 +192,8 @@ def scales(model: Model, at: FirstOrder, adjoint: Array) -> Scales:
     )
     rate = np.max(np.abs(lin.B).sum(axis=0) / state[:, None], axis=0)
     least = np.divide(LEAST_MOVE, rate, out=np.zeros_like(rate), where=rate > 0.0)
-    size = np.sqrt(max(float((own * own @ weight).max()), float(weight @ (least * least))) + TINY)
+    owned = (own * own + (LEAST_PART * lin.u) ** 2) @ weight
+    size = np.sqrt(max(float(owned.max()), float(weight @ (least * least))) + TINY)
     costate = np.abs(adjoint).max(axis=0)
     answer = LEAST_MOVE * size * size * float(model.dt.sum()) / state
     end = np.asarray(end_sizes(lin.G, state))

@@ -21,6 +21,9 @@ _ROUNDING = 1e-8
 #: Controls are compared with their own size; at least with what moves a state by this part of how
 #: far it moves.
 LEAST_MOVE = 1e-3
+#: Their size is that of what they deviate from where their own cost is least; at least this part of
+#: themselves.
+LEAST_PART = 1e-6
 #: Against division by zero.
 TINY = 1e-150
 

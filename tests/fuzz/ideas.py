@@ -99,12 +99,27 @@ def judged(problem: Any, p: Plan) -> list[str]:
         tolerance = float(np.sqrt(p.options["tolerance"]))
         certificate = call(lambda: certify(p, tolerance=tolerance))
         found += certificate.findings
-        # More conditions than controls, met all the same: multipliers are not unique, and the one
-        # of the cost may be as small as rounding makes it.
-        degenerate = len(p.multipliers.terminal) > p.controls.size
+        degenerate = _degenerate(problem, p)
         if certificate.error is None and not (certificate.value.extremal or degenerate):
             found.append(f"CONVERGED, but {str(certificate.value).splitlines()[0]}")
     return found + _kept(p)
+
+
+def _degenerate(problem: Any, p: Plan) -> bool:
+    """Whether controls move fewer directions of the end than there are conditions that are met.
+
+    Multipliers are not unique then, and the one of the cost may be as small as rounding makes it.
+    """
+    q, x = len(p.multipliers.terminal), p.mean[-1]
+    size = np.ptp(p.mean, axis=0) + 1e-9 * np.abs(x) + 1e-300
+    ends = np.stack([problem.terminal(x + 1e-6 * row) for row in np.diag(size)], axis=1)
+    reach, columns = (ends - problem.terminal(x)[:, None]) / (1e-6 * size), []
+    for A, B in zip(p.A[::-1], p.B[::-1], strict=True):
+        columns.append(reach @ B)
+        reach = reach @ A
+    effect = np.concatenate(columns, axis=1)
+    effect = effect / (np.abs(effect).max(axis=1, keepdims=True) + 1e-300)
+    return bool(np.linalg.matrix_rank(effect, tol=1e-9) < q)
 
 
 def _kept(p: Plan) -> list[str]:

@@ -21,6 +21,8 @@ from slipcar.planner.convex.subproblem import Subproblem
 Array = np.ndarray
 
 
+#: What OSQP takes for infinity.
+_INFINITY = 1e30
 #: Polishing finds the last digits once the active set is right.
 _SETTINGS: dict[str, Any] = {
     "eps_abs": 1e-6, "eps_rel": 1e-6, "polishing": True, "check_dualgap": False,
@@ -51,6 +53,8 @@ class OsqpSolver:
         if self._programme is None or self._programme.shape != shape:
             self._programme, self._workspace = _Programme(*shape), None
         programme = self._programme
+        if not max(np.abs(each).max(initial=0.0) for each in (sub.f, sub.g, sub.b)) < _INFINITY:
+            return failed(sub, 0, f"OSQP: numbers beyond {_INFINITY:g}")
         result, spent = self._run(programme, sub, slack=False), 0
         price = np.max(np.abs(programme.multipliers(result.y)[1]), initial=0.0)
         if result.info.status_val != 1 or not price <= sub.rho:
