@@ -71,7 +71,7 @@ test: $(INSTALLED)  ## all tests but the long ones
 	$(BIN)/python -m pytest -n $(TESTERS) $(ARGS)
 
 test-long: $(INSTALLED)  ## the tests that take minutes
-	$(BIN)/python -m pytest -m long $(ARGS)
+	$(BIN)/python -m pytest -m long --timeout 0 $(ARGS)
 
 fuzz: $(BENCH_INSTALLED)  ## random problems, worlds, options and files before an independent judge, minutes
 	PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)

@@ -34,7 +34,7 @@ ENDS = {"oldest": "lowest-direct", "newest": "highest"}
 EXTRAS = ("plot", "qp", "video", "data", "cluster", "report")
 LEARNING = "rl"
 MINUTES = 15
-TESTING = ("pytest", "hypothesis", "packaging")
+TESTING = ("pytest", "pytest-timeout", "hypothesis", "packaging")
 #: The quick part of the tests: half a minute, every package, no tool of developers.
 QUICK = (
     "envs/test_car.py", "envs/test_cost.py", "envs/test_scenario.py", "envs/test_slip_car.py",

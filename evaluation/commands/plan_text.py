@@ -74,7 +74,7 @@ def _expected(cost: Any) -> str:
     return (
         f"expected: total {cost.total:.4f} = effort {cost.effort:.4f}, corrections "
         f"{cost.feedback:.4f}, obstacle {cost.penalty:.4f}{goal}; collision at most "
-        f"{100.0 * cost.risk:.3f} % (Boole); {100.0 * cost.clipped:.2g} % of the controls clipped"
+        f"{100.0 * cost.risk:.3f} % (Boole); {100.0 * cost.clipped:.2f} % of the controls clipped"
     )
 
 

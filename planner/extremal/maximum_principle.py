@@ -28,8 +28,8 @@ from slipcar.planner.moments import covariance as moments
 from slipcar.planner.moments.propagation import gain, weight_step
 from slipcar.planner.problem.feasibility import (
     LEAST_MOVE,
-    LEAST_PART,
     TINY,
+    control_size,
     end_sizes,
     states_moved,
 )
@@ -192,8 +192,8 @@ def scales(model: Model, at: FirstOrder, adjoint: Array) -> Scales:
     )
     rate = np.max(np.abs(lin.B).sum(axis=0) / state[:, None], axis=0)
     least = np.divide(LEAST_MOVE, rate, out=np.zeros_like(rate), where=rate > 0.0)
-    owned = (own * own + (LEAST_PART * lin.u) ** 2) @ weight
-    size = np.sqrt(max(float(owned.max()), float(weight @ (least * least))) + TINY)
+    most = float(control_size(own, lin.u, weight).max())
+    size = np.sqrt(max(most, float(weight @ (least * least))) + TINY)
     costate = np.abs(adjoint).max(axis=0)
     answer = LEAST_MOVE * size * size * float(model.dt.sum()) / state
     end = np.asarray(end_sizes(lin.G, state))

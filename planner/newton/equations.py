@@ -40,7 +40,13 @@ from slipcar.planner.moments.propagation import (
     weight_step,
 )
 from slipcar.planner.newton.quantities import Dimensions, Quantities
-from slipcar.planner.problem.feasibility import LEAST_MOVE, LEAST_PART, TINY, end_sizes, path_sizes
+from slipcar.planner.problem.feasibility import (
+    LEAST_MOVE,
+    TINY,
+    control_size,
+    end_sizes,
+    path_sizes,
+)
 from slipcar.planner.trace.elementwise import choose, larger, magnitude, positive_part, within
 from slipcar.planner.trace.recursion import Carried, Field, Layout, Recursion, Symmetric
 
@@ -614,7 +620,7 @@ class Equations:
         return {
             "adjoint": q + A.T.dot(adjoint) - closed.T.dot(inside * slope),
             "off": larger(weight.dot(off * off), carried["off"]),
-            "size": larger(weight.dot(own * own + LEAST_PART**2 * (u * u)), carried["size"]),
+            "size": larger(control_size(own, u, weight), carried["size"]),
             "gap": carried["gap"] + magnitude(rows["f"]),
             "least": -larger(-x, -carried["least"]), "most": larger(x, carried["most"]),
             "terms": larger(terms, carried["terms"]), "reach": carried["reach"] + magnitude(B),

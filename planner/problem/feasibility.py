@@ -21,9 +21,9 @@ _ROUNDING = 1e-8
 #: Controls are compared with their own size; at least with what moves a state by this part of how
 #: far it moves.
 LEAST_MOVE = 1e-3
-#: Their size is that of what they deviate from where their own cost is least; at least this part of
-#: themselves.
-LEAST_PART = 1e-6
+#: That size is how far they are from where their own cost is least; at least this part of them:
+#: the last digits are rounding.
+_LEAST_PART = 1e-6
 #: Against division by zero.
 TINY = 1e-150
 
@@ -41,6 +41,19 @@ def path_sizes(moved: Array, terms: Array, A: Array) -> Any:
     for _ in range(3):
         terms = magnitude(A).dot(terms)
     return moved + _ROUNDING * terms + TINY
+
+
+def control_size(own: Array, u: Array, weight: Array) -> Any:
+    """The square of the size of controls, in the norm of their weights: (...,).
+
+    Args:
+        own: how far they are from where their own cost is least, (..., m).
+        u: controls, (..., m).
+        weight: diagonal of R, (m,).
+
+    Arrays of numbers and of expressions alike.
+    """
+    return (own * own + _LEAST_PART**2 * (u * u)).dot(weight)
 
 
 def end_sizes(G: Array, sizes: Any) -> Any:

@@ -31,8 +31,10 @@ Array = np.ndarray
 _KEPT, _BEHIND, _FREE = 3, 2.0, 3.0
 
 
-def expected_cost(model: Model, stakes: Stakes, plan: Steered, risk: float = 0.0) -> ExpectedCost:
-    """What a plan costs in expectation; `risk` is what is predicted for it."""
+def expected_cost(
+    model: Model, stakes: Stakes, plan: Steered, risk: float = 0.0, clipped: float = 0.0
+) -> ExpectedCost:
+    """What a plan costs in expectation; `risk` and `clipped` are what is predicted for it."""
     p = len(stakes.penalties)
     weight = model.dt[:, None] * stakes.penalties
     penalties = loss(plan.c[:, :p], plan.s[:, :p], weight, np.zeros(p, dtype=bool)).value
@@ -48,11 +50,11 @@ def expected_cost(model: Model, stakes: Stakes, plan: Steered, risk: float = 0.0
         penalty=float(penalties.sum()),
         goal=float(np.dot(stakes.terminal, plan.g**2 + spread)),
         risk=risk,
-        clipped=clipped(model, plan),
+        clipped=clipped,
     )
 
 
-def clipped(model: Model, plan: Steered) -> float:
+def clipped_part(model: Model, plan: Steered) -> float:
     """Part of the K m controls that u + K (x − μ), Gaussian, asks for beyond their bounds."""
     variance = np.einsum("kij,kjl,kil->ki", plan.gains, plan.covariance[:-1], plan.gains)
     s = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
@@ -125,7 +127,10 @@ class Field:
 
     def cost(self, plan: Steered) -> ExpectedCost:
         """What a plan costs in expectation, with the risk predicted for it."""
-        return expected_cost(self._model, self._stakes, plan, self.predicted_risk(plan))
+        return expected_cost(
+            self._model, self._stakes, plan,
+            risk=self.predicted_risk(plan), clipped=clipped_part(self._model, plan),
+        )  # fmt: skip
 
     def predicted_risk(self, plan: Steered) -> float:
         """Σ Φ(h/s) over nodes and constraints, at most 1: Boole's bound."""

@@ -213,7 +213,7 @@ def _steering(
             f"the feedback asks for {100.0 * cost.clipped:.2g} % of its controls beyond their "
             "bounds, where they are clipped: the cost is more than is expected"
         )
-        message = f"{message}; {say}" if message else say
+        message = "; ".join(filter(None, (message, say)))
     return Steering(plan, status, cost, risk, message, origin, field.steps)
 
 

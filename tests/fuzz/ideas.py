@@ -99,8 +99,8 @@ def judged(problem: Any, p: Plan) -> list[str]:
         tolerance = float(np.sqrt(p.options["tolerance"]))
         certificate = call(lambda: certify(p, tolerance=tolerance))
         found += certificate.findings
-        degenerate = _degenerate(problem, p)
-        if certificate.error is None and not (certificate.value.extremal or degenerate):
+        refused = certificate.error is None and not certificate.value.extremal
+        if refused and not _degenerate(problem, p):
             found.append(f"CONVERGED, but {str(certificate.value).splitlines()[0]}")
     return found + _kept(p)
 
@@ -181,10 +181,9 @@ def _same_elsewhere(recipe: Recipe, asked: dict[str, Any], p: Plan) -> list[str]
     if other.error is not None:
         return [f"refused where all is of order one: {other.error}"]
     q, C = other.value, Own(recipe).C
-    if p.status.ok is not q.status.ok and plain.cornered:
-        return []
     if p.status.ok is not q.status.ok:
-        return [f"{p.status.name}, but {q.status.name} where all is of order one"]
+        found = f"{p.status.name}, but {q.status.name} where all is of order one"
+        return [] if plain.cornered else [found]
     if _explosive(p) or _explosive(q):
         return []
     if p.status.ok and not abs(p.cost / C - q.cost) <= 1e-3 * (abs(q.cost) + q.effort) + 1e-9:

@@ -131,14 +131,14 @@ class Own:
 
     @property
     def cornered(self) -> bool:
-        """Whether the known controls are all on their bounds: the end is a corner of what is
-        reachable, where multipliers are not bounded and none need exist."""
-        bounds = getattr(self, "control_bounds", None)
-        return (
-            self.known is not None
-            and bounds is not None
-            and bool(np.isin(self.known, bounds).all())
-        )
+        """Whether the known controls are all on their bounds.
+
+        The end is a corner of what is reachable then, and no multipliers need exist.
+        """
+        if self.known is None or not hasattr(self, "control_bounds"):
+            return False
+        lower, upper = self.control_bounds
+        return bool(((self.known == lower) | (self.known == upper)).all())
 
     def _rolled(self, x: Array, t: Array, u: Array) -> Array:
         path = [x]

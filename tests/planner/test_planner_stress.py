@@ -7,6 +7,8 @@ import pytest
 
 from slipcar.envs import Scenario
 from slipcar.planner import Status, plan
+from slipcar.planner.convex.units import natural_units, scaled
+from slipcar.planner.problem.model import model_of
 
 PAPER = Scenario.named("paper")
 OPEN = Scenario.named("open")
@@ -150,3 +152,44 @@ def test_worlds_with_everything_drawn_at_random(seed, rollout):
         )
     assert p.status is not Status.SOLVER_FAILED
     check(p, rollout, tolerance)
+
+
+class Idle:
+    """dx = (0.7 x + 0.2) dt, whatever the controls, with ∫ uᵀRu + ℓ(x)ᵀu: u = −R⁻¹ℓ/2."""
+
+    start, times = np.array([0.3]), np.linspace(0.0, 1.0, 9)
+    control_weight = np.diag([1.37, 0.83])
+
+    def drift(self, t, x, u):
+        return 0.7 * x + 0.2 + 0.0 * u[..., :1]
+
+    def diffusion(self, t, x):
+        return np.zeros((*x.shape[:-1], 1, 1))
+
+    def terminal(self, x):
+        return 0.0 * x
+
+    def control_cost(self, t, x):
+        return np.concatenate([np.sin(3.0 * x), -0.6 * np.cos(x)], axis=-1)
+
+
+@pytest.mark.parametrize("radius", [None, 1.0])
+def test_controls_that_move_nothing_are_where_their_own_cost_is_least(radius):
+    problem = Idle()
+    if radius is not None:
+        problem.control_radius = radius
+    p = plan(problem)
+    assert p.status is Status.CONVERGED
+    least = -0.5 * problem.control_cost(p.times[:-1], p.mean[:-1]) / np.diag(Idle.control_weight)
+    np.testing.assert_allclose(p.controls, least, atol=1e-9)
+    assert p.certificate.extremal, str(p.certificate)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-80, 1e-180])
+def test_units_of_controls_that_do_nothing_are_finite(size):
+    model = model_of(Idle())
+    x, u = np.tile(Idle.start, (9, 1)), np.full((8, 2), size)
+    units = natural_units(model, x, u, box=False)
+    R = scaled(model, units).R
+    assert np.isfinite(R).all()
+    assert np.linalg.matrix_rank(R) == 2

@@ -212,6 +212,14 @@ def test_an_uncontrollable_linearisation_is_solved_and_says_what_is_missing():
     assert p.history[-1].virtual_control < 1e-9
 
 
+def test_osqp_is_not_given_what_it_takes_for_infinity(met):
+    sub = met["paper"][0]
+    huge = dataclasses.replace(sub, g=1e40 + sub.g)
+    solution = registry.make_solver("osqp").solve(huge)
+    assert not solution.found
+    assert "beyond 1e+30" in solution.message
+
+
 @pytest.mark.parametrize("solver", ["structured", "osqp", "cvxpy"])
 def test_a_goal_out_of_reach_is_called_infeasible_by_every_backend(solver):
     # |a_v| <= 0.1 for 5 s covers 0.625 m from rest to rest; the goal is 3.72 m away.
